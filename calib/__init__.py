@@ -1,0 +1,1 @@
+"""Calibration of RGB + thermal + LiDAR rigs. Nothing is built here yet; see docs/architecture.md."""

@@ -1,0 +1,103 @@
+"""The values that cross stage boundaries: frozen, validated when made, importing nothing of ours.
+
+Pixel arrays are never mutated by the stages that receive them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One image as a source delivers it.
+
+    `pixels` is H x W x 3 uint8 in BGR order for the RGB camera, H x W uint8 or uint16 counts for the
+    thermal camera. `stem` names it (posix path relative to its source, without suffix). `stamp_ns`
+    is its time in integer nanoseconds, None where the source has no clock. `flags` says in one word
+    each what was done to it on the way in (for example ``rgb-grey``).
+    """
+
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    stem: str
+    stamp_ns: int | None = None
+    flags: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        shape, dtype = self.pixels.shape, self.pixels.dtype
+        colour = len(shape) == 3 and shape[2] == 3 and dtype == np.uint8
+        counts = len(shape) == 2 and dtype in (np.uint8, np.uint16)
+        if not (colour or counts) or 0 in shape:
+            raise ValueError(f"expected HxWx3 uint8 BGR or HxW uint8/uint16 counts, got {shape} {dtype}")
+
+    @property
+    def size_wh(self) -> tuple[int, int]:
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """What the sensors saw at one moment: an RGB image and a thermal image, on their own grids."""
+
+    rgb: Image
+    fir: Image
+
+    def __post_init__(self) -> None:
+        if self.rgb.pixels.ndim != 3:
+            raise ValueError(f"rgb must be HxWx3 BGR, got {self.rgb.pixels.shape}")
+        if self.fir.pixels.ndim != 2:
+            raise ValueError(f"fir must be HxW counts, got {self.fir.pixels.shape}")
+
+    @property
+    def stem(self) -> str:
+        return self.rgb.stem
+
+    @property
+    def dt_ns(self) -> int | None:
+        """Thermal stamp minus RGB stamp; None where either has no clock."""
+        if self.rgb.stamp_ns is None or self.fir.stamp_ns is None:
+            return None
+        return self.fir.stamp_ns - self.rgb.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The thermal interval, in counts, that is stretched to the whole colour map; `lo` < `hi`."""
+
+    lo: float
+    hi: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.lo) and np.isfinite(self.hi) and self.lo < self.hi):
+            raise ValueError(f"expected finite counts lo < hi, got {self.lo} and {self.hi}")
+
+
+@dataclass(frozen=True, slots=True)
+class FusedFrame:
+    """A fused frame and what is known of how it came about.
+
+    `bgr` is H x W x 3 uint8 on the RGB grid, or its crop. `mask` is H x W uint8, 255 where thermal was
+    seen, None where it was seen everywhere. `window` is in thermal counts; `clipped_below` and
+    `clipped_above` are the shares [0, 1] of the thermal image outside it; `coverage` is the share of
+    the RGB grid that thermal covers, before any crop.
+    """
+
+    stem: str
+    bgr: NDArray[np.uint8]
+    mask: NDArray[np.uint8] | None
+    window: Window
+    clipped_below: float
+    clipped_above: float
+    coverage: float
+    rgb_stamp_ns: int | None = None
+    fir_stamp_ns: int | None = None
+    flags: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.bgr.ndim != 3 or self.bgr.shape[2] != 3 or self.bgr.dtype != np.uint8:
+            raise ValueError(f"bgr must be HxWx3 uint8, got {self.bgr.shape} {self.bgr.dtype}")
+        if self.mask is not None and (self.mask.shape != self.bgr.shape[:2] or self.mask.dtype != np.uint8):
+            raise ValueError(f"mask must be {self.bgr.shape[:2]} uint8, got {self.mask.shape} {self.mask.dtype}")
