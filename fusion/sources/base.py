@@ -1,0 +1,38 @@
+"""What every source of images offers, and the one table that names the sources."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+from fusion.frames import Image
+
+Role = Literal["rgb", "fir"]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One image of a source, not read yet.
+
+    `stem` is its posix path relative to the source, without suffix; `where` is what messages call it
+    (a path, or ``clip.mp4 frame 12``); `stamp_ns` is its time where the container itself has a clock.
+    """
+
+    stem: str
+    where: str
+    stamp_ns: int | None = None
+
+
+@runtime_checkable
+class Source(Protocol):
+    """A finite, ordered set of images with random access. `read` may be called from several threads."""
+
+    name: str
+    entries: Sequence[Entry]
+
+    def read(self, index: int) -> Image:
+        """Decode entry `index`. Raises `FrameError` when that one image cannot be used."""
+        ...
+
+    def close(self) -> None: ...
