@@ -1,0 +1,78 @@
+"""RGB and thermal (later LiDAR) recordings become fused frames that a tracker can live on.
+
+    from fusion import Fuser, open_pairs
+
+    for frame in Fuser(open_pairs("rgb/", "fir/")):
+        print(frame.stem, frame.bgr.shape, frame.window)
+
+Names are imported when first used, so that importing the package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fusion.batch import run
+    from fusion.colormaps import colormap_bgr
+    from fusion.config import BlendConfig
+    from fusion.errors import FrameError, FusionError, InputError, OutputError, UsageError
+    from fusion.frames import FrameSet, FusedFrame, Image, Window
+    from fusion.pairing import PairingRule
+    from fusion.pipeline import Fuser
+    from fusion.provenance import describe_run
+    from fusion.sinks.folder import FolderSink
+    from fusion.sync import open_pairs
+    from fusion.thermal import WindowRule
+    from fusion.warp import Warp
+
+__all__ = [
+    "BlendConfig",
+    "FolderSink",
+    "FrameError",
+    "FrameSet",
+    "FusedFrame",
+    "Fuser",
+    "FusionError",
+    "Image",
+    "InputError",
+    "OutputError",
+    "PairingRule",
+    "UsageError",
+    "Warp",
+    "Window",
+    "WindowRule",
+    "colormap_bgr",
+    "describe_run",
+    "open_pairs",
+    "run",
+]
+
+_HOMES = {
+    "batch": ("run",),
+    "colormaps": ("colormap_bgr",),
+    "config": ("BlendConfig",),
+    "errors": ("FrameError", "FusionError", "InputError", "OutputError", "UsageError"),
+    "frames": ("FrameSet", "FusedFrame", "Image", "Window"),
+    "pairing": ("PairingRule",),
+    "pipeline": ("Fuser",),
+    "provenance": ("describe_run",),
+    "sinks.folder": ("FolderSink",),
+    "sync": ("open_pairs",),
+    "thermal": ("WindowRule",),
+    "warp": ("Warp",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'fusion' has no attribute {name!r}")
+    value = getattr(import_module(f"fusion.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,124 @@
+"""Runs a whole sequence through a `Fuser` into a sink: in order, resumable, with several threads.
+
+The work is decoding, a few kernels and encoding, all of which release the interpreter lock, so
+threads scale; OpenCV's own pool is held to one thread meanwhile, because pools that fight cost more
+than they give. At most a few frames are in flight, so memory does not grow with the sequence.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import cv2
+
+from fusion.errors import FrameError, InputError
+from fusion.pipeline import Fuser
+from fusion.sinks.folder import FolderSink
+from fusion.sinks.index import Row
+
+IN_FLIGHT_PER_WORKER = 3
+T = TypeVar("T")
+
+
+@dataclass(slots=True)
+class RunReport:
+    """What a run did. Shares are [0, 1], means over the fused frames, kept ones included."""
+
+    pairs: int = 0
+    fused: int = 0
+    kept: int = 0
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    flags: Counter[str] = field(default_factory=Counter)
+    clipped_below: float = 0.0
+    clipped_above: float = 0.0
+    window_lo: tuple[float, float] | None = None
+    window_hi: tuple[float, float] | None = None
+
+    def add(self, row: Row, kept: bool) -> None:
+        if row.status != "fused":
+            self.skipped.append((row.stem, row.reason))
+            return
+        self.fused += not kept
+        self.kept += kept
+        done = self.fused + self.kept
+        self.flags.update(flag for flag in row.flags.split(";") if flag)
+        self.clipped_below += (float(row.clipped_below) - self.clipped_below) / done
+        self.clipped_above += (float(row.clipped_above) - self.clipped_above) / done
+        self.window_lo = _widened(self.window_lo, float(row.window_lo))
+        self.window_hi = _widened(self.window_hi, float(row.window_hi))
+
+
+def run(
+    fuser: Fuser,
+    sink: FolderSink,
+    *,
+    workers: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RunReport:
+    """Fuse every pair of `fuser` into the open `sink`; frames that are there already are kept.
+
+    A frame that cannot be used is skipped and counted, or raised when the configuration is strict.
+    `progress(done, total)` is called in order, from this thread. Raises `InputError` when no frame at
+    all could be fused, `OutputError` when the sink cannot be written.
+    """
+    report = RunReport(pairs=len(fuser))
+    sink.expect(fuser.pairs.stems(index)[0] for index in range(len(fuser)))
+
+    def work(index: int) -> tuple[Row, bool]:
+        stem, fir_stem = fuser.pairs.stems(index)
+        row = sink.finished(stem, fuser.pairs.changed_ns(index))
+        if row is not None:
+            return row, True
+        try:
+            return sink.write(fuser.fuse(index), fir_stem), False
+        except FrameError as error:
+            if fuser.config.strict:
+                raise
+            return Row.skipped(stem, fir_stem, error), False
+
+    with opencv_on_one_thread():
+        for done, (row, kept) in enumerate(_in_order(work, len(fuser), workers), start=1):
+            sink.record(row)
+            report.add(row, kept)
+            progress(done, len(fuser))
+    if report.fused + report.kept == 0:
+        stem, reason = report.skipped[0]
+        raise InputError(f"no frame could be fused; the first, {stem!r}: {reason}")
+    return report
+
+
+def _in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
+    """`work(0), work(1), …` by `workers` threads, at most a few ahead of what has been taken."""
+    if workers == 1:
+        yield from map(work, range(count))
+        return
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="fuse")
+    try:
+        pending: deque[Future[T]] = deque()
+        for index in range(count):
+            pending.append(pool.submit(work, index))
+            if len(pending) >= workers * IN_FLIGHT_PER_WORKER:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def opencv_on_one_thread() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _widened(span: tuple[float, float] | None, value: float) -> tuple[float, float]:
+    return (value, value) if span is None else (min(span[0], value), max(span[1], value))

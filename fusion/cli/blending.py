@@ -1,0 +1,221 @@
+"""What `fusion blend` does once its options are known (the heavy imports live here)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fusion.batch import opencv_on_one_thread, run
+from fusion.codecs import encode_png
+from fusion.config import BlendConfig, load_config
+from fusion.errors import InputError, OutputError, UsageError
+from fusion.files import replace_file
+from fusion.manifest import load_manifest
+from fusion.pairing import report_lines
+from fusion.pipeline import Fuser
+from fusion.provenance import describe_run
+from fusion.report.sheet import contact_sheet
+from fusion.report.text import closing_lines, plan_lines, warnings_of
+from fusion.sinks.folder import FolderSink
+from fusion.sync import Pairs, open_pairs
+
+PREVIEW = "preview.png"
+MAX_WORKERS = 256
+
+# option of the command -> its place in the configuration
+PLACES = {
+    "preset": ("preset",),
+    "strict": ("strict",),
+    "pair": ("pairing", "by"),
+    "rgb_key": ("pairing", "rgb_key"),
+    "fir_key": ("pairing", "fir_key"),
+    "pair_map": ("pairing", "map"),
+    "tolerance_ms": ("pairing", "tolerance_ms"),
+    "window": ("thermal", "window"),
+    "window_unit": ("thermal", "window_unit"),
+    "window_over": ("thermal", "window_over"),
+    "celsius_per_count": ("thermal", "celsius_per_count"),
+    "celsius_at_zero": ("thermal", "celsius_at_zero"),
+    "clahe": ("thermal", "clahe"),
+    "colormap": ("thermal", "colormap"),
+    "fir_colour": ("thermal", "fir_colour"),
+    "homography": ("warp", "homography"),
+    "points": ("warp", "points"),
+    "outside": ("warp", "outside"),
+    "fill_bgr": ("warp", "fill_bgr"),
+    "method": ("blend", "method"),
+    "alpha": ("blend", "alpha"),
+    "format": ("output", "format"),
+    "quality": ("output", "quality"),
+}
+
+
+def settings_of(config: Path | None, options: Mapping[str, Any]) -> BlendConfig:
+    """The configuration file with the options that were given laid over it."""
+    nested: dict[str, Any] = {}
+    for option, (*groups, key) in PLACES.items():
+        if options[option] is not None:
+            table = nested
+            for group in groups:
+                table = table.setdefault(group, {})
+            table[key] = options[option]
+    return load_config(config, nested)
+
+
+def run_blend(
+    settings: BlendConfig,
+    inputs: Sequence[str],
+    out: Path | None,
+    *,
+    dataset: str | None,
+    workers: int | None,
+    overwrite: bool,
+    dry_run: bool,
+    preview: bool,
+    quiet: bool,
+) -> None:
+    if out is None and (preview or not dry_run):
+        raise UsageError("no output folder", where="--out", hint="give -o OUT, or only --dry-run")
+    if workers is not None and not 1 <= workers <= MAX_WORKERS:
+        raise UsageError(f"{workers} is no number of threads", where="--workers", hint=f"1 to {MAX_WORKERS}")
+    if out is not None:
+        refuse_overlap(inputs, out)
+    pairs = open_inputs(settings, inputs, dataset)
+    try:
+        report_pairing(pairs, settings.strict, show=dry_run)
+        if out is None or (dry_run and not preview):
+            return
+        fuser = Fuser(pairs, settings)
+        if dry_run:
+            replace_file(out / PREVIEW, _preview_png(fuser))
+            print(f"preview: {out / PREVIEW}")
+            return
+        if not quiet:
+            print("\n".join(plan_lines(fuser)), flush=True)
+        with _sink(fuser, out, overwrite) as sink:
+            if preview:
+                sink.write_file(PREVIEW, _preview_png(fuser))
+            with progress_bar(quiet) as progress:
+                report = run(fuser, sink, workers=workers or default_workers(), progress=progress)
+            if pairs.pairing.unmatched:
+                sink.write_file("unmatched.csv", unmatched_csv(pairs))
+        if not quiet:
+            print("\n".join(closing_lines(fuser, report, out)))
+        for warning in warnings_of(fuser, report):
+            print(f"fusion: warning: {warning}", file=sys.stderr)
+    finally:
+        pairs.close()
+
+
+def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | None) -> Pairs:
+    """The pairs of two inputs, of one 4-channel input, or of a data set's root."""
+    if dataset is None:
+        fir = inputs[1] if len(inputs) == 2 else None
+        return open_pairs(inputs[0], fir, settings.pairing.rule(), fir_colour=settings.thermal.fir_colour)
+    if len(inputs) != 1:
+        raise UsageError("a data set has one root", where="--dataset", hint="fusion blend --dataset NAME ROOT -o OUT")
+    manifest = load_manifest(dataset)
+    if not manifest.registered and not (settings.warp.homography or settings.warp.points):
+        raise InputError(
+            "its thermal images are not registered to its RGB images, and blending them as they are would be wrong",
+            where=f"data set {manifest.name}",
+            hint="give --homography FILE or --points CSV",
+        )
+    root = Path(inputs[0])
+    rgb, fir = manifest.globs(root)
+    given = settings.pairing.model_fields_set
+    rule = settings.pairing.rule() if given else manifest.pairing_rule(root)
+    return open_pairs(rgb, fir, rule, fir_colour=settings.thermal.fir_colour)
+
+
+def report_pairing(pairs: Pairs, strict: bool, *, show: bool) -> None:
+    pairing = pairs.pairing
+    if show:
+        print("\n".join(report_lines(pairing)))
+    if strict and pairing.unmatched:
+        first = pairing.unmatched[0]
+        raise InputError(
+            f"{len(pairing.unmatched)} images have no partner; the first: {first.where}: {first.reason}",
+            hint="--dry-run lists them; without --strict they are left out",
+        )
+
+
+def refuse_overlap(inputs: Sequence[str], out: Path) -> None:
+    """An output inside an input folder would be read as input the next time; the reverse would overwrite."""
+    target = out.resolve()
+    for spec in inputs:
+        folder = fixed_folder(spec)
+        if folder is None:
+            continue
+        if target == folder or folder in target.parents:
+            raise OutputError("lies inside the input folder", where=out, hint="choose another -o")
+        for ours in (target / "fused", target / "mask"):
+            if folder == ours or ours in folder.parents:
+                raise OutputError(f"would overwrite the input {spec}", where=out, hint="choose another -o")
+
+
+def fixed_folder(spec: str) -> Path | None:
+    """The folder that a folder or glob specification reads from; None for single files."""
+    path = Path(spec)
+    if path.is_dir():
+        return path.resolve()
+    if path.exists():
+        return None
+    fixed = [part for part in path.parts]
+    for depth, part in enumerate(fixed):
+        if any(mark in part for mark in "*?["):
+            return Path(*fixed[:depth]).resolve()
+    return None
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar with rate and time left on the terminal; nothing where there is none."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]:.0f} frames/s"), TimeRemainingColumn())
+    with Progress("fusing", *columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("fusing", total=None, rate=0.0)
+        began = time.monotonic()
+
+        def advance(done: int, total: int) -> None:
+            rate = done / max(time.monotonic() - began, 1e-6)
+            bar.update(task, completed=done, total=total, rate=rate)
+
+        yield advance
+
+
+def default_workers() -> int:
+    """One thread for every core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def unmatched_csv(pairs: Pairs) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("role", "name", "reason"))
+    writer.writerows((lost.role, Path(lost.where).name, lost.reason) for lost in pairs.pairing.unmatched)
+    return text.getvalue().encode("utf-8", "surrogateescape")
+
+
+def _sink(fuser: Fuser, out: Path, overwrite: bool) -> FolderSink:
+    output = fuser.config.output
+    return FolderSink(
+        out, describe_run(fuser), image_format=output.format, quality=output.quality, overwrite=overwrite
+    )
+
+
+def _preview_png(fuser: Fuser) -> bytes:
+    with opencv_on_one_thread():  # the same bytes on any machine
+        return encode_png(contact_sheet(fuser))

@@ -1,0 +1,92 @@
+"""What makes a run what it is: enough to repeat it, and nothing that changes from run to run."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from fusion.codecs import PNG_ENCODER
+from fusion.pipeline import Fuser
+
+LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "simplejpeg")
+
+
+def describe_run(fuser: Fuser) -> dict[str, Any]:
+    """Nested, TOML-able: versions, inputs, effective configuration, registration, windows.
+
+    The inputs are known by their paired names, not by their paths, so that a moved data set is still
+    the same run; registration files are known by the SHA-256 of their bytes.
+    """
+    config = fuser.config.model_dump(exclude_none=True)
+    del config["strict"]  # changes where a run stops, not what it writes
+    for key in ("homography", "points"):
+        if key in config["warp"]:
+            config["warp"][key] = _file_mark(config["warp"][key])
+    if "map" in config["pairing"]:
+        config["pairing"]["map"] = _file_mark(config["pairing"]["map"])
+    return {
+        "versions": _versions(),
+        "inputs": {
+            "pairs": len(fuser),
+            "unmatched": len(fuser.pairs.pairing.unmatched),
+            "names_sha256": _names_digest(fuser),
+        },
+        "config": _plain(config),
+        "registration": _registration(fuser),
+        "window": fuser.windows.record(),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "fusion": version("fusionprep"),
+        "python": platform.python_version(),
+        "png_encoder": PNG_ENCODER,
+        **{name: version(name) for name in LIBRARIES},
+    }
+
+
+def _names_digest(fuser: Fuser) -> str:
+    digest = hashlib.sha256()
+    for index in range(len(fuser)):
+        digest.update("\0".join(fuser.pairs.stems(index)).encode("utf-8", "surrogateescape") + b"\n")
+    return digest.hexdigest()
+
+
+def _file_mark(path: str) -> str:
+    return f"{Path(path).name} sha256:{hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
+
+
+def _registration(fuser: Fuser) -> dict[str, Any]:
+    registration, warp = fuser.registration, fuser.warp
+    record: dict[str, Any] = {
+        "kind": registration.kind,
+        "H_rgb_fir": registration.H_rgb_fir.tolist(),
+        "fir_size_wh": list(fuser.sizes[0]),
+        "rgb_size_wh": list(fuser.sizes[1]),
+        "coverage": round(warp.coverage, 6),
+        "border_ltrb": list(warp.border_ltrb),
+        "crop_xywh": list(warp.crop_xywh),
+    }
+    fit = registration.fit
+    if fit is not None:
+        record["fit"] = {
+            "points": fit.count,
+            "inliers": fit.inliers,
+            "outlier_rows": list(fit.outlier_rows),
+            "rms_px": round(fit.rms_px, 6),
+            "max_px": round(fit.max_px, 6),
+        }
+        if fit.leave_one_out_px is not None:
+            record["fit"]["leave_one_out_px"] = round(fit.leave_one_out_px, 6)
+    return record
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists, as TOML has them."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value

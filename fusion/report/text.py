@@ -1,0 +1,81 @@
+"""What a blend run says: its plan before, a table and its warnings after. Plain text, for logs too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fusion.batch import RunReport
+from fusion.pipeline import Fuser
+from fusion.thermal import clip_advice
+
+LOUD_SKIPS = 10
+
+
+def plan_lines(fuser: Fuser) -> list[str]:
+    """What will be done, before the first frame: pairs, registration, window, colours."""
+    config, warp, pairing = fuser.config, fuser.warp, fuser.pairs.pairing
+    fir, rgb = (f"{w}x{h}" for w, h in fuser.sizes)
+    left, top, right, bottom = warp.border_ltrb
+    x, y, width, height = warp.crop_xywh
+    rows = [
+        ("pairs", f"{len(fuser)} by {pairing.rule_by}, {len(pairing.unmatched)} unmatched"),
+        ("sizes", f"thermal {fir}, RGB {rgb}"),
+        ("registration", _registration(fuser)),
+        ("coverage", f"{warp.coverage:.1%} of RGB"),
+    ]
+    if not warp.full:
+        rows.append(("border", f"left {left}, top {top}, right {right}, bottom {bottom} px"))
+        rows.append(("outside", f"crop to {width}x{height} at ({x}, {y})" if config.warp.outside == "crop" else config.warp.outside))
+    rows.append(("preset", f"{config.preset}: colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}"))
+    return [*_table(rows), *(f"note: {note}" for note in (*fuser.registration.notes, *pairing.notes))]
+
+
+def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
+    """The table at the end of a run, every dropped frame counted."""
+    done = report.fused + report.kept
+    rows = [
+        ("fused", f"{report.fused}" + (f", and {report.kept} kept from before" if report.kept else "")),
+        ("skipped", f"{len(report.skipped)}"),
+        ("unmatched", f"{len(fuser.pairs.pairing.unmatched)}"),
+        ("window", f"{_span(report.window_lo)} to {_span(report.window_hi)} counts"),
+        ("clipped", f"{report.clipped_below:.1%} below, {report.clipped_above:.1%} above"),
+    ]
+    dt = fuser.pairs.pairing.summary()
+    if dt.dt_median_ms is not None:
+        rows.append(("time apart", f"median {dt.dt_median_ms:.3f} ms, largest {dt.dt_max_ms:.3f} ms"))
+    rows += [(flag, f"{count} of {done} frames") for flag, count in sorted(report.flags.items())]
+    rows.append(("written to", str(out)))
+    return _table(rows)
+
+
+def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
+    """What the user should act on, a line each."""
+    warnings = [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
+    if len(report.skipped) > LOUD_SKIPS:
+        warnings.append(f"… and {len(report.skipped) - LOUD_SKIPS} more, all named in frames.csv")
+    if fuser.pairs.pairing.unmatched:
+        warnings.append(f"{len(fuser.pairs.pairing.unmatched)} images without a partner are named in unmatched.csv")
+    if fuser.size_groups > 1:
+        warnings.append(f"the images come in {fuser.size_groups} different sizes; frames differ in size accordingly")
+    warnings += [f"window sample passed over: {reason}" for reason in fuser.windows.skipped]
+    advice = clip_advice(report.clipped_below, report.clipped_above, fuser.config.thermal.rule())
+    return [*warnings, *([advice] if advice else [])]
+
+
+def _registration(fuser: Fuser) -> str:
+    registration, fit = fuser.registration, fuser.registration.fit
+    if fit is None:
+        return registration.kind
+    text = f"{fit.inliers} of {fit.count} points, rms {fit.rms_px:.2f} px, largest {fit.max_px:.2f} px"
+    return text + (f", left out {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else "")
+
+
+def _span(span: tuple[float, float] | None) -> str:
+    if span is None:
+        return "-"
+    return f"{span[0]:.6g}" if span[0] == span[1] else f"{span[0]:.6g}…{span[1]:.6g}"
+
+
+def _table(rows: list[tuple[str, str]]) -> list[str]:
+    width = max(len(label) for label, _ in rows)
+    return [f"{label:<{width}}  {text}" for label, text in rows]

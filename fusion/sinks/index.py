@@ -1,0 +1,81 @@
+"""`frames.csv`: one row per pair, what became of it and how."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+from fusion.errors import FrameError
+from fusion.frames import FusedFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One pair. `status` is ``fused`` or ``skipped`` (then `reason` says why and the rest is empty).
+
+    Stamps and `dt_ns` are integer nanoseconds, windows are thermal counts, clipped and coverage are
+    shares [0, 1], `size` is the fused file's length in bytes.
+    """
+
+    stem: str
+    fir_stem: str
+    status: str
+    rgb_stamp_ns: str = ""
+    fir_stamp_ns: str = ""
+    dt_ns: str = ""
+    window_lo: str = ""
+    window_hi: str = ""
+    clipped_below: str = ""
+    clipped_above: str = ""
+    coverage: str = ""
+    size: str = ""
+    flags: str = ""
+    reason: str = ""
+
+    @classmethod
+    def fused(cls, frame: FusedFrame, fir_stem: str, size: int) -> Row:
+        stamps = (frame.rgb_stamp_ns, frame.fir_stamp_ns)
+        dt_ns = None if None in stamps else stamps[1] - stamps[0]  # type: ignore[operator]
+        return cls(
+            frame.stem,
+            fir_stem,
+            "fused",
+            *("" if value is None else str(value) for value in (*stamps, dt_ns)),
+            f"{frame.window.lo:.9g}",
+            f"{frame.window.hi:.9g}",
+            f"{frame.clipped_below:.6f}",
+            f"{frame.clipped_above:.6f}",
+            f"{frame.coverage:.6f}",
+            str(size),
+            ";".join(frame.flags),
+        )
+
+    @classmethod
+    def skipped(cls, stem: str, fir_stem: str, error: FrameError) -> Row:
+        return cls(stem, fir_stem, "skipped", reason=error.what)
+
+
+COLUMNS = tuple(field.name for field in fields(Row))
+
+
+def to_csv(rows: Iterable[Row], header: bool = True) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    if header:
+        writer.writerow(COLUMNS)
+    writer.writerows(astuple(row) for row in rows)
+    return text.getvalue()
+
+
+def read_rows(path: Path, *, header: bool = True) -> list[Row]:
+    """The whole rows of a CSV. A last line that a killed run left half written does not count."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="surrogateescape")
+    except FileNotFoundError:
+        return []
+    whole = text[: text.rfind("\n") + 1]
+    cells = list(csv.reader(io.StringIO(whole, newline="")))
+    return [Row(*row) for row in cells[1 if header else 0 :] if len(row) == len(COLUMNS)]

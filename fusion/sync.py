@@ -1,0 +1,129 @@
+"""Sources become `FrameSet`s: what belongs together is read together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal, Protocol
+
+from fusion.frames import FrameSet, Image
+from fusion.pairing import Pairing, PairingRule, pair
+from fusion.sources import open_rgbt, open_source
+from fusion.sources.base import Entry, Source
+from fusion.sources.channels import RgbtFiles
+
+
+class Pairs(Protocol):
+    """A finite, ordered set of `FrameSet`s with random access; `read` is safe from several threads."""
+
+    name: str
+    pairing: Pairing
+
+    def __len__(self) -> int: ...
+
+    def stems(self, index: int) -> tuple[str, str]:
+        """The stems of the RGB and of the thermal image."""
+        ...
+
+    def read(self, index: int) -> FrameSet:
+        """Decode both images of a pair. Raises `FrameError` where one cannot be used."""
+        ...
+
+    def read_fir(self, index: int) -> Image:
+        """Decode the thermal image alone."""
+        ...
+
+    def changed_ns(self, index: int) -> int:
+        """When the files of a pair last changed (0 where they are not files of their own)."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class PairedSources:
+    """Pairs from an RGB source and a thermal source."""
+
+    def __init__(self, rgb: Source, fir: Source, rule: PairingRule) -> None:
+        self.name = f"{rgb.name} + {fir.name}"
+        self.pairing = pair(rgb.entries, fir.entries, rule)
+        self._rgb, self._fir = rgb, fir
+
+    def __len__(self) -> int:
+        return len(self.pairing.pairs)
+
+    def _entries(self, index: int) -> tuple[Entry, Entry]:
+        rgb, fir, _ = self.pairing.pairs[index]
+        return self._rgb.entries[rgb], self._fir.entries[fir]
+
+    def stems(self, index: int) -> tuple[str, str]:
+        rgb, fir = self._entries(index)
+        return rgb.stem, fir.stem
+
+    def read(self, index: int) -> FrameSet:
+        return FrameSet(self._rgb.read(self.pairing.pairs[index][0]), self.read_fir(index))
+
+    def read_fir(self, index: int) -> Image:
+        return self._fir.read(self.pairing.pairs[index][1])
+
+    def changed_ns(self, index: int) -> int:
+        return _changed_ns(self._entries(index))
+
+    def close(self) -> None:
+        self._rgb.close()
+        self._fir.close()
+
+
+class PairedChannels:
+    """Pairs from files that hold RGB and thermal together, in four channels."""
+
+    def __init__(self, files: RgbtFiles) -> None:
+        self.name = files.name
+        self.pairing = Pairing.of_channels(len(files.entries))
+        self._files = files
+
+    def __len__(self) -> int:
+        return len(self._files.entries)
+
+    def stems(self, index: int) -> tuple[str, str]:
+        stem = self._files.entries[index].stem
+        return stem, stem
+
+    def read(self, index: int) -> FrameSet:
+        return self._files.read(index)
+
+    def read_fir(self, index: int) -> Image:
+        return self.read(index).fir
+
+    def changed_ns(self, index: int) -> int:
+        return _changed_ns([self._files.entries[index]])
+
+    def close(self) -> None:
+        self._files.close()
+
+
+def open_pairs(
+    rgb: str | Path,
+    fir: str | Path | None = None,
+    rule: PairingRule | None = None,
+    *,
+    fir_colour: Literal["refuse", "luma"] = "refuse",
+) -> Pairs:
+    """Open folders, glob patterns, videos or single files and pair them; nothing is decoded yet.
+
+    `fir` None: `rgb` names 4-channel RGB+T files. `fir_colour` says what to do with thermal images
+    that are in colour. Raises `InputError` where nothing is found or nothing pairs.
+    """
+    if fir is None:
+        return PairedChannels(open_rgbt(rgb))
+    rgb_source = open_source(rgb, "rgb")
+    fir_source = open_source(fir, "fir", fir_colour=fir_colour)
+    return PairedSources(rgb_source, fir_source, rule or PairingRule())
+
+
+def _changed_ns(entries: Sequence[Entry]) -> int:
+    changed = 0
+    for entry in entries:
+        with suppress(OSError):  # a frame of a video is no file of its own
+            changed = max(changed, Path(entry.where).stat().st_mtime_ns)
+    return changed
