@@ -68,7 +68,9 @@ class PairingRule:
             raise UsageError(what, hint="give both the same number of groups")
         if (self.map_file is not None) != (self.by == "map") and self.by != "auto":
             what = (
-                "pairing by map needs a mapping file" if self.by == "map" else "a mapping file needs rule map"
+                "pairing by map needs a mapping file (--pair-map)"
+                if self.by == "map"
+                else "a mapping file needs rule map"
             )
             raise UsageError(what)
         if self.tolerance_ns is not None and self.tolerance_ns < 0:
@@ -97,7 +99,7 @@ class Unmatched(NamedTuple):
 class PairingSummary:
     """Counts, and time differences (thermal minus RGB) in milliseconds: signed median, largest absolute."""
 
-    rule_by: By
+    rule_by: By | Literal["channels"]
     n_rgb: int
     n_fir: int
     n_pairs: int
@@ -113,7 +115,7 @@ class PairingSummary:
 class Pairing:
     """Pairs in RGB order, what is left over with reasons, and remarks. `rule_by` is never ``auto``."""
 
-    rule_by: By
+    rule_by: By | Literal["channels"]
     pairs: tuple[Pair, ...]
     unmatched: tuple[Unmatched, ...]
     tolerance_ns: int | None
@@ -121,7 +123,11 @@ class Pairing:
     n_rgb: int
     n_fir: int
 
-    @property
+    @classmethod
+    def of_channels(cls, count: int) -> Pairing:
+        """`count` files that each hold their own RGB and thermal channels: nothing to look for."""
+        return cls("channels", tuple(Pair(k, k, None) for k in range(count)), (), None, (), count, count)
+
     def summary(self) -> PairingSummary:
         dts = [p.dt_ns for p in self.pairs if p.dt_ns is not None]
         roles = Counter(u.role for u in self.unmatched)
@@ -174,7 +180,7 @@ def pair(rgb: Sequence[Entry], fir: Sequence[Entry], rule: PairingRule | None = 
 
 def report_lines(pairing: Pairing, limit: int = 20) -> list[str]:
     """The pairing report: what matched, time differences, the first `limit` unmatched, remarks."""
-    s = pairing.summary
+    s = pairing.summary()
     lines = [f"{s.n_pairs} pairs by {s.rule_by} of {s.n_rgb} RGB and {s.n_fir} thermal images"]
     if s.dt_median_ms is not None:
         bound = "" if pairing.tolerance_ns is None else f", tolerance {_ms(pairing.tolerance_ns)}"
@@ -386,7 +392,7 @@ def _timeline(
             at.setdefault(stamp, []).append(i)
     if not at:
         what = f"no {side} image has a time stamp, neither a clock nor one in a name like '{entries[0].stem}'"
-        hint = f"a stamp is {_STAMP_FORMS}; a key can point at it"
+        hint = f"a stamp is {_STAMP_FORMS}; --rgb-key and --fir-key can point at it"
         raise InputError(what, hint=hint)
     for members in (m for m in at.values() if len(m) > 1):
         for i in members:
@@ -418,7 +424,7 @@ def _default_tolerance(a: list[int], b: list[int]) -> int:
     """Half the median interval of the denser stream, in whole ns."""
     steps = [[t - s for s, t in pairwise(times)] for times in (a, b) if len(times) > 1]
     if not steps:
-        raise UsageError("no tolerance follows from one time stamp each", hint="give a tolerance")
+        raise UsageError("no tolerance follows from one time stamp each", hint="give --tolerance-ms")
     return min(statistics.median_low(d) + statistics.median_high(d) for d in steps) // 4
 
 
@@ -579,9 +585,7 @@ def _others(rgb: Sequence[Entry], fir: Sequence[Entry], by: By, more_than: int =
         for other in ("stem", "index", "stamp", "order")
         if other != by
     }
-    rules[f"file names alone (key '{_FILE_NAME}' on both sides)"] = PairingRule(
-        "stem", _FILE_NAME, _FILE_NAME
-    )
+    rules[f"--rgb-key '{_FILE_NAME}' and the same --fir-key"] = PairingRule("stem", _FILE_NAME, _FILE_NAME)
     counts = {name: len(_try(rgb, fir, rule).pairs) for name, rule in rules.items()}
     return [f"{name} would match {k} of {n}" for name, k in counts.items() if k > more_than]
 
@@ -603,7 +607,7 @@ def _wider_tolerance(rgb: Sequence[Entry], fir: Sequence[Entry], rule: PairingRu
         return f"the two sides do not overlap in time, they are {apart / 1e9:.3f} s apart: is it one clock?"
     pairs = _try(rgb, fir, replace(rule, by="stamp", tolerance_ns=2**63)).pairs
     need = max((abs(p.dt_ns or 0) for p in pairs), default=0)
-    return f"a tolerance of {_ms(need, 6)} would match {len(pairs)}" if pairs else ""
+    return f"--tolerance-ms {need / 1e6:.6f} would match {len(pairs)}" if pairs else ""
 
 
 def _notes(rgb: Sequence[Entry], fir: Sequence[Entry], by: By, match: _Match) -> tuple[str, ...]:

@@ -18,15 +18,44 @@ Spans = tuple[NDArray[np.int64], NDArray[np.int64]]
 _A = TypeVar("_A", bound=np.ndarray)
 
 STEPS = 256  # sampling positions per pixel: what `fusion.kernels.resample` reads
+_LEAST_DENOMINATOR = 1e-2  # of the largest: beyond it the scale of areas varies a million-fold
+_LARGEST_AREA_RATIO = 1e4
 _SLACK_PX = 0.5 / STEPS
 _BLOCK_PIXELS = 1 << 15  # a block's float64 temporaries stay in the processor's cache
+
+
+def fault_of(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size, rgb_size_wh: Size) -> str:
+    """Why `H_rgb_fir` cannot carry images of these sizes, whatever it overlaps; empty where it can.
+
+    Not finite, singular, folding (its denominator comes near zero or changes sign on the thermal image),
+    or an area more than 10,000 times larger or smaller than scale-to-fit. The inverse needs no test of
+    its own: where the thermal image lands its denominator is 1 / w, w that of `H_rgb_fir`.
+    """
+    H, (w, h), (W, rows) = H_rgb_fir, fir_size_wh, rgb_size_wh
+    if not np.isfinite(H).all():
+        return "the homography holds NaN or infinity"
+    # Both images as unit squares, so that their sizes do not count.
+    unit = np.diag([1 / W, 1 / rows, 1]) @ (H / max(np.abs(H).max(), 1e-300)) @ np.diag([w, h, 1])
+    if not np.linalg.cond(unit) <= 1e12:
+        return "the homography is singular: it squeezes the image to a line or a point"
+    corners = np.array([[-0.5, -0.5, 1], [w - 0.5, -0.5, 1], [w - 0.5, h - 0.5, 1], [-0.5, h - 0.5, 1]])
+    mapped = corners @ H.T
+    denominators = mapped[:, 2] * np.sign(mapped[0, 2])
+    if denominators.min() <= _LEAST_DENOMINATOR * denominators.max():
+        return "the homography folds the thermal image: part of it would lie at or behind the horizon"
+    with np.errstate(all="ignore"):
+        x, y = (mapped[:, :2] / mapped[:, 2:]).T
+        area = abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 / (W * rows)
+    if not 1 / _LARGEST_AREA_RATIO <= area <= _LARGEST_AREA_RATIO:
+        return f"absurd scale: the thermal image would fill {area:.2g} times the area of the RGB image"
+    return ""
 
 
 def valid_spans(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size, rgb_size_wh: Size) -> Spans:
     """The valid columns of each RGB row, as half-open [first, stop): two int64 arrays, one value a row.
 
-    A row that has none gets (W, 0). `H_rgb_fir` must be invertible and must not fold the thermal image
-    (`fusion.registration.check`); then the valid region is convex and one interval a row says it all.
+    A row that has none gets (W, 0). `H_rgb_fir` must have no `fault_of`; then the valid region is convex
+    and one interval a row says it all.
     """
     (w, h), (W, H) = fir_size_wh, rgb_size_wh
     x, y, z = _inverse(H_rgb_fir, fir_size_wh)
@@ -87,8 +116,9 @@ def largest_rectangle(spans: Spans) -> tuple[int, int, int, int]:
 class Warp:
     """Carries a thermal image onto the RGB grid by a homography; built once, then only read.
 
-    Parameters: `H_rgb_fir` (3, 3) float64, a registration that `fusion.registration.check` has passed;
-    sizes in pixels. Raises `ValueError` when the matrix is singular or no RGB pixel is valid.
+    Parameters: `H_rgb_fir` (3, 3) float64 (`fusion.registration.check` says what is wrong with one);
+    sizes in pixels. Raises `ValueError` when the matrix cannot carry an image (`fault_of`) or no RGB
+    pixel is valid.
 
     `mask` is H x W uint8 on the RGB grid, 255 where valid, read-only; `coverage` its share [0, 1];
     `full` whether that is all of it. `crop_xywh` is the largest rectangle of valid pixels, and
@@ -112,6 +142,8 @@ class Warp:
         fir, rgb = self.fir_size_wh, self.rgb_size_wh
         if matrix.shape != (3, 3) or min(*fir, *rgb) < 1:
             raise ValueError(f"expected a 3x3 matrix and sizes >= 1, got {matrix.shape}, {fir} and {rgb}")
+        if fault := fault_of(matrix, fir, rgb):
+            raise ValueError(fault)
         spans = valid_spans(matrix, fir, rgb)
         x, y, w, h = crop = largest_rectangle(spans)
         if not w:
@@ -138,10 +170,9 @@ class Warp:
         and `out` stays as it is. A grey level differs from exact interpolation by less than one before
         rounding. Outside `mask` values are finite and mean nothing (edge pixels drawn out).
         """
-        if index.shape != self.fir_size_wh[::-1] or index.dtype != np.uint8:
-            raise ValueError(
-                f"expected {self.fir_size_wh[::-1]} uint8 on the thermal grid, got {index.shape} {index.dtype}"
-            )
+        shape = self.fir_size_wh[::-1]
+        if index.shape != shape or index.dtype != np.uint8:
+            raise ValueError(f"expected {shape} uint8 on the thermal grid, got {index.shape} {index.dtype}")
         if self._sampling is None:
             return index
         from fusion.kernels import resample  # compiled code: loaded when the first frame needs it
@@ -153,10 +184,7 @@ def _inverse(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size) -> NDArray[np.fl
     """H_fir_rgb, scaled so that its denominator is positive where the thermal image lands."""
     matrix = np.asarray(H_rgb_fir, dtype=np.float64)
     centre = matrix[2] @ [(fir_size_wh[0] - 1) / 2, (fir_size_wh[1] - 1) / 2, 1.0]
-    try:
-        return np.linalg.inv(matrix / centre)
-    except np.linalg.LinAlgError:
-        raise ValueError("H_rgb_fir is singular") from None
+    return np.linalg.inv(matrix / centre)
 
 
 def _mask(spans: Spans, width: int) -> NDArray[np.uint8]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ def stems(pairing: Pairing, rgb: list[Entry], fir: list[Entry]) -> list[tuple[st
 def assert_partition(pairing: Pairing, rgb: list[Entry], fir: list[Entry]) -> None:
     """Every entry is in exactly one pair or exactly once among the unmatched."""
     for k, (role, side) in enumerate((("rgb", rgb), ("fir", fir))):
-        paired = [side[p[k]].where for p in pairing.pairs]
+        paired = [side[(p.rgb, p.fir)[k]].where for p in pairing.pairs]
         left = [u.where for u in pairing.unmatched if u.role == role]
         assert sorted(paired + left) == sorted(e.where for e in side)
     assert all(u.reason for u in pairing.unmatched)
@@ -190,7 +191,7 @@ def test_stamp_against_brute_force(a: list[int], b: list[int], limit: int, start
     assert [p[:2] for p in got.pairs] == want
     assert [p.dt_ns for p in got.pairs] == [b[j] - a[i] for i, j in want]
     in_time = [b[p.fir] for p in sorted(got.pairs, key=lambda p: a[p.rgb])]
-    assert all(s < t for s, t in zip(in_time, in_time[1:], strict=False))  # one-to-one and in order
+    assert all(s < t for s, t in pairwise(in_time))  # one-to-one and in order
     assert_partition(got, rgb, fir)
 
 
@@ -245,13 +246,13 @@ def test_stamps_in_names_pair_by_time_and_strays_are_reported() -> None:
 
 
 def test_names_without_any_stamp_are_refused_with_the_forms_that_are_read() -> None:
-    with pytest.raises(InputError, match="no RGB image has a time stamp.*10, 13, 16 or 19 digits"):
+    with pytest.raises(InputError, match=r"no RGB image has a time stamp.*10, 13, 16 or 19 digits"):
         pair(entries("20210611_123456"), entries("1600000000"), PairingRule("stamp"))
 
 
 def test_no_pair_in_time_says_a_tolerance_that_would_work() -> None:
     rgb, fir = clocked(range(0, 10**9, 10**8)), clocked(range(3 * 10**7, 10**9, 10**8))
-    with pytest.raises(InputError, match=r"a tolerance of 30\.000000 ms would match 10\b"):
+    with pytest.raises(InputError, match=r"--tolerance-ms 30\.000000 would match 10\b"):
         pair(rgb, fir, PairingRule("stamp", tolerance_ns=10**6))
     assert len(pair(rgb, fir, PairingRule("stamp", tolerance_ns=30_000_000)).pairs) == 10
 
@@ -262,7 +263,7 @@ def test_clocks_that_do_not_overlap_are_called_so() -> None:
 
 
 def test_one_stamp_each_gives_no_default_tolerance() -> None:
-    with pytest.raises(UsageError, match="give a tolerance"):
+    with pytest.raises(UsageError, match="give --tolerance-ms"):
         pair(clocked([5]), clocked([9]), PairingRule("stamp"))
     assert pair(clocked([5]), clocked([9]), PairingRule("stamp", tolerance_ns=4)).pairs[0].dt_ns == 4
 
@@ -330,7 +331,7 @@ def test_json_map_reports_what_is_missing_or_named_twice(tmp_path: Path) -> None
     assert said["3"] == "more than one RGB image is called 'k'"
     assert set(said) == {"2", "3", "4", "5", "6"}
     assert all("more than once" in said[k] for k in "456")
-    assert got.summary.n_unmatched_map == 5
+    assert got.summary().n_unmatched_map == 5
 
 
 def test_a_longer_path_in_the_map_does_not_match_another_folder(tmp_path: Path) -> None:
@@ -427,7 +428,7 @@ def test_no_pair_shows_both_sides_and_the_rules_that_would_match() -> None:
 def test_no_pair_sees_case_unicode_form_and_folders() -> None:
     with pytest.raises(InputError, match="2 names would match but for upper and lower case or Unicode form"):
         pair(entries("A", "e\u0301", "q"), entries("a", "\u00e9", "z"))
-    with pytest.raises(InputError, match=r"file names alone .* would match 2 of 2"):
+    with pytest.raises(InputError, match=r"--rgb-key .* --fir-key would match 2 of 2"):
         pair(entries("vi/a", "vi/b"), entries("ir/a", "ir/b"))
 
 
@@ -444,7 +445,7 @@ def test_summary_and_report_count_everything() -> None:
         clocked([k * ms for k in (2, 96, 203, *range(900, 960))], "fir"),
     )
     got = pair(rgb, fir, PairingRule("stamp", tolerance_ns=5 * ms))
-    s = got.summary
+    s = got.summary()
     assert (s.n_rgb, s.n_fir, s.n_pairs, s.n_unmatched_rgb, s.n_unmatched_fir) == (3, 63, 3, 0, 60)
     assert (s.dt_median_ms, s.dt_max_ms, s.tolerance_ms) == (2.0, 4.0, 5.0)
     lines = report_lines(got, limit=7)
@@ -458,6 +459,12 @@ def test_report_without_clocks_or_leftovers_is_one_line() -> None:
     assert report_lines(pair(entries("a", "b"), entries("a", "b"))) == [
         "2 pairs by stem of 2 RGB and 2 thermal images"
     ]
+
+
+def test_channels_of_one_file_are_their_own_pairs() -> None:
+    got = Pairing.of_channels(3)
+    assert [p[:2] for p in got.pairs] == [(0, 0), (1, 1), (2, 2)]
+    assert report_lines(got) == ["3 pairs by channels of 3 RGB and 3 thermal images"]
 
 
 def test_inputs_are_not_changed() -> None:

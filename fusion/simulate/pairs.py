@@ -18,7 +18,7 @@ import tomlkit
 from numpy.typing import NDArray
 
 from fusion.errors import OutputError, UsageError
-from fusion.simulate import (
+from fusion.simulate.drift import (
     AMBIENT_DEGC,
     MARGIN,
     PERSON_DEGC,
@@ -202,7 +202,8 @@ class Scene:
         wrong = inwards * rng.uniform(0.03, 0.06, (2, 1)) * self.rgb_size_wh[0]
         # Both picks err; 2.2 sigma is the limit of a careful hand, and keeps good points well under 2 px.
         noise = (rng.normal(size=(2, *fir.shape)) * POINT_NOISE_PX / np.sqrt(2)).clip(-0.62, 0.62)
-        rgb, fir = rgb + noise[0], fir + noise[1]
+        coarser = max(1.0, *np.divide(self.rgb_size_wh, self.fir_size_wh))
+        rgb, fir = rgb + noise[0], fir + noise[1] / coarser
         rgb[outliers] += wrong
         return np.hstack([rgb, fir]).round(2), tuple(outliers.tolist())
 
@@ -264,8 +265,9 @@ def _check(frames: int, rgb_size_wh: Size, fir_size_wh: Size, seed: int) -> None
         raise UsageError(f"seed {seed} is negative", where="seed", hint="take 0 or more")
     lo, hi = SIZE_LIMITS
     for where, size in (("rgb_size_wh", rgb_size_wh), ("fir_size_wh", fir_size_wh)):
-        if len(size) != 2 or any(side % 2 or not lo <= side <= hi for side in size):
-            hint = f"take an even width and height of {lo} to {hi} pixels"
+        fits = len(size) == 2 and all(lo <= side <= hi and side % 2 == 0 for side in size)
+        if not fits or max(size) > 2 * min(size):
+            hint = f"take an even width and height of {lo} to {hi} pixels, one at most twice the other"
             raise UsageError(f"cannot simulate a camera of size {size}", where=where, hint=hint)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -36,3 +36,30 @@ class Source(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+class OpenSource(Protocol):
+    """Opens what a spec names. Raises `InputError` when nothing in it can be used."""
+
+    def __call__(
+        self, spec: str, role: Role, *, fir_colour: Literal["refuse", "luma"], max_pixels: int
+    ) -> Source: ...
+
+
+@dataclass(frozen=True, slots=True)
+class SourceKind:
+    """One row of the table: what it `expects` in words, whether it `accepts` a spec, how to `open` it."""
+
+    expects: str
+    accepts: Callable[[str], bool]
+    open: OpenSource
+
+
+# Name -> "module:attribute" of its `SourceKind`, tried in this order; the entry points of the group
+# "fusion.sources" have the same form and come after them. Text, so that naming a source imports none.
+SOURCES: dict[str, str] = {
+    "folder": "fusion.sources.folders:FOLDER",
+    "image": "fusion.sources.folders:IMAGE",
+    "video": "fusion.sources.video:VIDEO",
+    "glob": "fusion.sources.folders:GLOB",
+}
