@@ -165,7 +165,7 @@ def _without_png_metadata(data: bytes, where: str) -> bytes:
 def _decode_jpeg(data: bytes, where: str, max_pixels: int) -> Pixels:
     try:
         height, width, space, _ = simplejpeg.decode_jpeg_header(data)
-        _check_size(width, height, where, max_pixels)
+        _check_size(int(width), int(height), where, max_pixels)
         if space == "Gray":
             return simplejpeg.decode_jpeg(data, "GRAY")[:, :, 0]
         if space in ("CMYK", "YCCK"):
@@ -184,12 +184,12 @@ def _decode_webp(data: bytes, where: str, max_pixels: int) -> Pixels:
     if kind == b"VP8X":
         if data[20] & 0x02:
             raise FrameError("an animated WebP is not one image", where=where, hint="split it into frames")
-        size = (int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1)
+        width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
     elif kind == b"VP8L":
-        size = ((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     else:
-        size = tuple(v & 0x3FFF for v in struct.unpack_from("<HH", data, 26))
-    _check_size(*size, where, max_pixels)
+        width, height = (value & 0x3FFF for value in struct.unpack_from("<HH", data, 26))
+    _check_size(width, height, where, max_pixels)
     return _by_opencv(data, where)
 
 

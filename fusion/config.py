@@ -87,7 +87,7 @@ class BlendingConfig(_Group):
 
 class OutputConfig(_Group):
     format: Literal["png", "jpg"] = "png"
-    quality: int = Field(default=95, ge=1, le=100)
+    quality: int = Field(default=90, ge=1, le=100)
 
 
 class BlendConfig(_Group):

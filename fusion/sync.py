@@ -9,9 +9,9 @@ from typing import Literal, Protocol
 
 from fusion.frames import FrameSet, Image
 from fusion.pairing import Pairing, PairingRule, pair
-from fusion.sources import open_rgbt, open_source
+from fusion.sources import open_source
 from fusion.sources.base import Entry, Source
-from fusion.sources.channels import RgbtFiles
+from fusion.sources.channels import RgbtFiles, open_rgbt
 
 
 class Pairs(Protocol):

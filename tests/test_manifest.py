@@ -115,8 +115,14 @@ def test_the_place_of_a_fault_is_named(tmp_path: Path) -> None:
         "a\\\\b.png",
         "~/x.png",
         "./a.png",
-    ]
-    + ["a//b.png", "", "**/*.png", "{a,b}/*.png", "a\\u0000b.png", "a/", ".."],
+        "a//b.png",
+        "",
+        "**/*.png",
+        "{a,b}/*.png",
+        "a\\u0000b.png",
+        "a/",
+        "..",
+    ],
 )
 def test_patterns_that_could_leave_the_root_or_mislead_are_refused(tmp_path: Path, pattern: str) -> None:
     with pytest.raises(UsageError, match=r"rgb\.files"):

@@ -52,7 +52,7 @@ def blend(
     method: Annotated[str | None, Parameter(group=BLEND, help="alpha or laplacian.")] = None,
     alpha: Annotated[float | None, Parameter(group=BLEND, help="Weight of RGB. Default: 0.85.")] = None,
     format: Annotated[Literal["png", "jpg"] | None, Parameter(group=BLEND, help="png is lossless. Default: png.")] = None,  # noqa: A002
-    quality: Annotated[int | None, Parameter(group=BLEND, help="JPEG quality 1 to 100. Default: 95.")] = None,
+    quality: Annotated[int | None, Parameter(group=BLEND, help="JPEG quality 1 to 100. Default: 90.")] = None,
     workers: Annotated[int | None, Parameter(group=RUN, help="Threads. Default: one a core; the output is the same.")] = None,
     strict: Annotated[bool | None, Parameter(group=RUN, help="Stop at the first unmatched or unusable frame.")] = None,
     overwrite: Annotated[bool, Parameter(group=RUN, help="Replace the frames of another run in OUT.")] = False,

@@ -52,7 +52,7 @@ class FolderSink:
         run: Mapping[str, Any] | None = None,
         *,
         image_format: str = "png",
-        quality: int = 95,
+        quality: int = 90,
         overwrite: bool = False,
     ) -> None:
         self.out = Path(out)
