@@ -24,6 +24,8 @@ _COUNTED = 4032  # fewer than 4096: two tallies share one 32-bit sum
 _SAMPLED = 8192
 _BLENDED = 4096  # a multiple of 4: four pixels are three 32-bit words
 
+_KEEP = np.where(np.arange(256) > 0, 0xFFFFFF, 0).astype(np.uint32)  # mask -> which bytes of a colour stay
+
 _local = threading.local()
 
 
@@ -72,8 +74,8 @@ def _window_table(lo: float, hi: float, top: int) -> tuple[int, NDArray[np.uint3
     last = min(max(math.floor(hi) + 1, 0), top)
     counts = np.arange(first, last + 1, dtype=np.float64)
     index = np.floor(255 * np.clip((counts - lo) / (hi - lo), 0, 1) + 0.5)
-    table = index.astype(np.uint32) | (counts < lo).astype(np.uint32) << 8 | (counts > hi).astype(np.uint32) << 20
-    return first, _flat(table)
+    table = index + (counts < lo) * 2.0**8 + (counts > hi) * 2.0**20
+    return first, _flat(table.astype(np.uint32))
 
 
 def resample(
@@ -95,7 +97,9 @@ def resample(
     fraction = _checked("fraction", fraction, np.uint16, offset.shape)
     if image.size >= 1 << 31:
         raise ValueError(f"the image has too many pixels to be addressed: {image.shape}")
-    out = np.empty(offset.shape, np.uint8) if out is None else _writable(out, image, offset, fraction)
+    if out is None:
+        out = np.empty(offset.shape, np.uint8)
+    out = _writable(out, offset.shape, image, offset, fraction)
     taps = scratch("kernels.taps", image.shape, np.uint32)
     pairs = scratch("kernels.pairs", image.shape[1:], np.uint16)
     if not _sample(_read_only(image), _flat(offset), _flat(fraction), taps, pairs, out.reshape(-1)):
@@ -121,15 +125,16 @@ def blend_indexed(
         raise ValueError(f"expected alpha in [0, 1], got {alpha}")
     bgr = _checked("bgr", bgr, np.uint8, (None, None, 3))
     index = _checked("index", index, np.uint8, bgr.shape[:2])
-    table = _checked("table_bgr", table_bgr, np.uint8, (256, 3)).astype(np.uint32)
+    words = np.zeros((256, 4), np.uint8)
+    words[:, :3] = _checked("table_bgr", table_bgr, np.uint8, (256, 3))
     seen = index if mask is None else _checked("mask", mask, np.uint8, bgr.shape[:2])
     out = np.empty(bgr.shape, np.uint8)
     _blend(
         _flat(bgr),
         _flat(index),
-        _flat(table[:, 0] | table[:, 1] << 8 | table[:, 2] << 16),
+        _flat(words.view(np.uint32)),
         _flat(seen),
-        mask is not None,
+        _flat(_KEEP if mask is not None else _KEEP[:0]),
         *_digits(alpha),
         scratch("kernels.colours", (_BLENDED * 3 // 4,), np.uint32),
         scratch("kernels.kept", (_BLENDED * 3 // 4,), np.uint32),
@@ -155,13 +160,13 @@ def _checked(name: str, array: NDArray[Any], dtype: DTypeLike, shape: tuple[int 
     return array if array.flags.aligned else array.copy()
 
 
-def _writable(out: NDArray[np.uint8], image: NDArray, offset: NDArray, fraction: NDArray) -> NDArray[np.uint8]:
+def _writable(out: NDArray[np.uint8], shape: tuple[int, ...], *inputs: NDArray[Any]) -> NDArray[np.uint8]:
     """`out`, if it can be written and overlaps no input: the compiled loops rely on that."""
-    if out.shape != offset.shape or out.dtype != np.uint8:
-        raise ValueError(f"out: expected {offset.shape} uint8, got {out.shape} {out.dtype}")
+    if out.shape != shape or out.dtype != np.uint8:
+        raise ValueError(f"out: expected {shape} uint8, got {out.shape} {out.dtype}")
     if not (out.flags.c_contiguous and out.flags.writeable):
         raise ValueError("out: expected a contiguous array that may be written")
-    if any(np.may_share_memory(out, array) for array in (image, offset, fraction)):
+    if any(np.may_share_memory(out, array) for array in inputs):
         raise ValueError("out: overlaps an input")
     return out
 
@@ -279,15 +284,13 @@ def _interpolate(taps, offset, fraction, out):
 
 
 @_compiled
-def _blend(bgr, index, words, mask, masked, high, middle, low, colours, kept, out):
+def _blend(bgr, index, words, mask, keep, high, middle, low, colours, kept, out):
     colour_bytes, kept_bytes = colours.view(np.uint8), kept.view(np.uint8)
-    keep = np.full(256, _u32(0xFFFFFF))
-    keep[0] = 0
     for start in range(0, index.size, _BLENDED):
         stop = min(start + _BLENDED, index.size)
         rgb = bgr[3 * start : 3 * stop]
         _spread(index[start:stop], words, colours)
-        if masked and _holes(mask[start:stop]):
+        if keep.size and _holes(mask[start:stop]):
             _spread(mask[start:stop], keep, kept)
             _replace(colour_bytes, kept_bytes, rgb)
         _mix(rgb, colour_bytes, high, middle, low, out[3 * start : 3 * stop])
@@ -298,7 +301,8 @@ def _spread(index, words, out):
     """The low three bytes of words[index], one after the other (little-endian, as all our platforms)."""
     last = index.size - 1
     for i in range(index.size // 4):
-        a, b, c, d = words[index[4 * i]], words[index[4 * i + 1]], words[index[4 * i + 2]], words[index[4 * i + 3]]
+        j = 4 * i
+        a, b, c, d = words[index[j]], words[index[j + 1]], words[index[j + 2]], words[index[j + 3]]
         out[3 * i] = _u32(a | _u32(b << _u32(24)))
         out[3 * i + 1] = _u32(_u32(b >> _u32(8)) | _u32(c << _u32(16)))
         out[3 * i + 2] = _u32(_u32(c >> _u32(16)) | _u32(d << _u32(8)))

@@ -51,7 +51,7 @@ def _inside(path: str) -> str:
 
 
 def _pattern(path: str) -> str:
-    if any(c in path for c in "{}"):
+    if "**" in path or any(c in path for c in "{}"):
         raise ValueError("expected a pattern of *, ? and [ ] only: ** and { } are not expanded")
     return _inside(path)
 

@@ -72,18 +72,19 @@ def from_pattern(pattern: str, k: int) -> str:
     )
 
 
-def miniature(manifest: Manifest, root: Path) -> list[tuple[str, ...]]:
+def miniature(manifest: Manifest, root: Path) -> list[list[str]]:
     """Build the layout with three frames from the manifest's own patterns; gives the files of each frame."""
-    frames = [tuple(from_pattern(pattern, k) for _, pattern in manifest.layout()) for k in range(3)]
+    frames = [[from_pattern(pattern, k) for _, pattern in manifest.layout()] for k in range(3)]
     for frame in frames:
         for (role, _), name in zip(manifest.layout(), frame, strict=True):
             write_image(root / name, manifest, role)
     if manifest.pairing is not None and manifest.pairing.map_file is not None:
         table = root / manifest.pairing.map_file
         table.parent.mkdir(parents=True, exist_ok=True)
-        rows = [frame[:2] for frame in frames]
-        csv = "\n".join(["rgb,fir", *(",".join(row) for row in rows)])
-        table.write_text(json.dumps(dict(rows)) if table.suffix == ".json" else csv)
+        csv = "\n".join(["rgb,fir", *(",".join(frame) for frame in frames)])
+        table.write_text(
+            json.dumps({frame[0]: frame[1] for frame in frames}) if table.suffix == ".json" else csv
+        )
     return frames
 
 
@@ -178,10 +179,8 @@ def test_no_python_and_nothing_unexpected_under_datasets() -> None:
 
 def test_real_msrs_frames_fit_the_checks(shared_data: Path) -> None:
     manifest = load_manifest(DATASETS / "msrs.toml")
-    rgb, fir = (
-        open_source(shared_data / "rgbt_pairs" / "MSRS" / kind, role)
-        for kind, role in (("vi", "rgb"), ("ir", "fir"))
-    )  # type: ignore[arg-type]
+    folder = shared_data / "rgbt_pairs" / "MSRS"
+    rgb, fir = open_source(folder / "vi", "rgb"), open_source(folder / "ir", "fir")
     got = pair(rgb.entries, fir.entries, PairingRule("stem"))
     assert len(got.pairs) == 5
     assert not got.unmatched

@@ -223,7 +223,7 @@ def test_four_channel_files_have_one_pattern(tmp_path: Path) -> None:
 def test_a_root_without_the_layout_says_what_was_expected_and_where_to_get_it(
     tmp_path: Path, good: Manifest
 ) -> None:
-    touch(tmp_path / "root", "vi/1.png", "._ir/1.png")
+    touch(tmp_path / "root", "vi/1.png", "ir/._1.png")
     for root in (tmp_path / "root", tmp_path / "gone"):
         with pytest.raises(InputError) as caught:
             good.globs(root)

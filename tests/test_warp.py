@@ -85,7 +85,7 @@ def test_mask_coverage_and_crop_are_those_of_brute_force(
     H: NDArray, fir: tuple[int, int], rgb: tuple[int, int]
 ) -> None:
     if fault_of(H, fir, rgb):
-        with pytest.raises(ValueError, match="homography|scale"):
+        with pytest.raises(ValueError, match=r"homography|scale"):
             Warp(H, fir, rgb)
         return
     surely, maybe = (inside(H, fir, rgb, HALF_STEP + e) for e in (-1e-9, 1e-9))
@@ -124,8 +124,8 @@ def test_largest_rectangle_of_any_convex_polygon(corners: list[tuple[float, floa
             for p, e in zip(hull, edges, strict=True)
         ]
     )
-    mask = (side >= 0).all(0) | (side <= 0).all(0)
-    some = mask.any(1)
+    mask = np.asarray((side >= 0).all(axis=0) | (side <= 0).all(axis=0))
+    some = mask.any(axis=-1)
     first = np.where(some, mask.argmax(1), 13)
     stop = np.where(some, 13 - mask[:, ::-1].argmax(1), 0)
     x, y, w, h = largest_rectangle((first, stop))
@@ -238,20 +238,22 @@ def test_a_matrix_and_its_negative_are_one_homography() -> None:
     assert np.array_equal(a.mask, b.mask)
 
 
-def test_a_12_megapixel_grid_is_ready_within_a_second() -> None:
+def test_a_12_megapixel_grid_is_ready_at_once() -> None:
+    # 0.3 s here; the bound only tells the row-wise way from one that tries every rectangle.
     H = homography(0.12, 6.0, (200, -20), (1e-5, 2e-5))
     fir, rgb = (640, 480), (4096, 3072)
 
-    def seconds() -> float:
-        start = time.process_time()
-        Warp(H, fir, rgb)
-        return time.process_time() - start
-
-    assert min(seconds() for _ in range(2)) < 1
+    start = time.process_time()
+    Warp(H, fir, rgb)
+    assert time.process_time() - start < 5
     first, stop = valid_spans(H, fir, rgb)
     x, y, w, h = largest_rectangle((first, stop))
     assert (first[y : y + h] <= x).all()
     assert (stop[y : y + h] >= x + w).all()
+
+
+def grey(path: Path) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 @pytest.mark.parametrize(("group", "name"), [("MSRS", "00055D"), ("MSRS", "00004N"), ("RoadScene", "14")])
@@ -265,11 +267,7 @@ def test_points_register_a_deformed_real_pair(shared_data: Path, group: str, nam
 
     root = shared_data / "rgbt_warped" / group
     flow = loadmat(root / "flow" / f"{name}.png.mat")["flow"][0].astype(float)
-    warped, original = (
-        cv2.imread(str(root / kind / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for kind in ("ir_warp", "ir")
-    )
-    assert warped is not None
-    assert original is not None
+    warped, original = (grey(root / kind / f"{name}.png") for kind in ("ir_warp", "ir"))
     h, w = flow.shape[:2]
     target = (flow + 1) * [(w - 1) / 2, (h - 1) / 2]  # ir_warp(x) = ir(target(x))
     known = ((target >= 0) & (target <= [w - 1, h - 1])).all(-1)

@@ -60,30 +60,7 @@ def blend(
     preview: Annotated[bool, Parameter(group=RUN, help="Write OUT/preview.png, a contact sheet of every step.")] = False,
     quiet: Annotated[bool, Parameter(group=RUN, help="No progress, no table.")] = False,
 ) -> None:
-    """Fuse RGB and thermal images into a folder of frames.
-
-    Thermal is paired with RGB, windowed, warped onto the RGB grid, coloured and blended in. OUT gets
-    fused/, mask/ (where thermal does not cover the frame), frames.csv and run.toml. The same command
-    run again keeps finished frames.
-
-    Examples:
-
-      fusion blend rgb/ fir/ -o out/ --preview
-
-      fusion blend rgb/ fir/ -o out/ --points points.csv --outside crop
-
-      fusion blend 'day/*_eo-*.jpg' 'day/*_thermal-*.tiff' -o out/ --pair index
-
-      fusion blend rgb/ fir/ -o out/ --window 7000 7400 --window-unit counts --colormap inferno
-
-      fusion blend rgb.mp4 fir.mkv -o out/ --tolerance-ms 20 --format jpg
-
-      fusion blend MFNet/images/ -o out/ --preset thesis
-
-      fusion blend --dataset msrs MSRS/ -o out/
-
-      fusion blend rgb/ fir/ --dry-run
-    """
+    """Fuse RGB and thermal images into a folder of frames."""
     options = dict(locals())
     from fusion.cli import blending
 

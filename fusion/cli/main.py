@@ -10,6 +10,22 @@ from cyclopts import App, CycloptsError, Parameter
 
 from fusion.errors import FusionError
 
+BLEND_HELP = (
+    "Fuse RGB and thermal images into a folder of frames.\n\n"
+    "Thermal is paired with RGB, windowed, warped onto the RGB grid, coloured and blended in. OUT gets fused/, mask/"
+    " (where thermal does not cover the frame), frames.csv and run.toml. The same command run again keeps finished"
+    " frames."
+)
+BLEND_EXAMPLES = """Examples:
+  fusion blend rgb/ fir/ -o out/ --preview
+  fusion blend rgb/ fir/ --dry-run
+  fusion blend rgb/ fir/ -o out/ --points points.csv --outside crop
+  fusion blend rgb/ fir/ -o out/ --window 7000 7400 --window-unit counts --colormap inferno
+  fusion blend 'day/*_eo-*.jpg' 'day/*_thermal-*.tiff' -o out/ --pair index
+  fusion blend rgb.mp4 fir.mkv -o out/ --tolerance-ms 20 --format jpg
+  fusion blend MFNet/images/ -o out/ --preset thesis
+  fusion blend MSRS/ -o out/ --dataset msrs"""
+
 app = App(
     name="fusion",
     help="Fused RGB-thermal frames for trackers. Start with: fusion blend RGB FIR -o OUT --preview",
@@ -17,13 +33,13 @@ app = App(
     help_format="plaintext",
     default_parameter=Parameter(negative=()),
 )
-app.command("fusion.cli.blend:blend", name="blend", help="Fuse RGB and thermal images into a folder.")
+app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
 datasets = App(name="datasets", help="List and show the data sets whose layout is known.")
 datasets.command("fusion.cli.datasets:list_datasets", name="list", help="List the known data sets.")
-datasets.command("fusion.cli.datasets:show_dataset", name="show", help="Show one data set: layout, licence, source.")
+datasets.command("fusion.cli.datasets:show_dataset", name="show", help="Show one data set: layout, licence, where to get it.")
 app.command(datasets)
 simulate = App(name="simulate", help="Make sample data with the truth beside it.")
-simulate.command("fusion.cli.simulate:simulate_pairs", name="pairs", help="Make unregistered RGB-thermal pairs.")
+simulate.command("fusion.cli.simulate:simulate_pairs", name="pairs", help="Draw unregistered RGB-thermal pairs of a mine, with their truth.")
 app.command(simulate)
 
 USAGE, INTERRUPTED, INTERNAL = 2, 130, 70
@@ -36,7 +52,7 @@ def main() -> None:
 
 def _guarded() -> int:
     try:
-        app(exit_on_error=False, print_error=False)
+        app(sys.argv[1:], exit_on_error=False, print_error=False)
     except CycloptsError as error:
         return _complain(f"{' '.join(str(error).split())} (fusion COMMAND --help shows the options)", USAGE)
     except FusionError as error:

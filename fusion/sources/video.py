@@ -29,6 +29,7 @@ VIDEO_SUFFIXES = frozenset(
 )
 _KEPT_BYTES = 96 * 2**20  # decoded frames kept for threads that ask nearly in order
 _KEPT_FRAMES = (16, 64)
+_NEAR = 16  # a key frame nearer than this is decoded up to: other threads may still want what lies between
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,8 @@ class _Index:
     """What the packets say, without decoding; the entries are in order of presentation.
 
     `pts` and `position` (place in decoding order) belong to entry i; `key` is the entry of the last key
-    frame at or before it, from which it can be decoded; `keys` are the entries that are key frames.
+    frame at or before it, from which it can be decoded; `reach` the last entry among those decoded up to
+    it, after which all that it builds on has come out; `keys` are the entries that are key frames.
     `damaged` are entries whose packet the container marks as damaged, `announced` is the number of
     frames the header tells of (0: it does not tell), `ignored` counts what else the file holds.
     """
@@ -44,6 +46,7 @@ class _Index:
     pts: list[int]
     position: list[int]
     key: list[int]
+    reach: list[int]
     keys: list[int]
     damaged: list[int]
     time_base: Fraction
@@ -82,6 +85,7 @@ class VideoSource:
         self.entries: Sequence[Entry] = _entries(spec, index)
         self.frames_decoded = 0
         self._entry_of = {pts: entry for entry, pts in enumerate(index.pts)}
+        self._fresh: dict[int, VideoFrame] = {}
         self._kept: OrderedDict[int, VideoFrame] = OrderedDict()
         low, high = _KEPT_FRAMES
         self._kept_frames = max(low, min(high, _KEPT_BYTES // index.frame_bytes))
@@ -110,6 +114,7 @@ class VideoSource:
                 self._container.close()
             self._container, self._packets, self._next = None, iter(()), len(self._index.pts)
             self._kept.clear()
+            self._fresh.clear()
 
     def _frame(self, index: int, where: str) -> VideoFrame:
         found = len(self._index.pts)
@@ -126,14 +131,15 @@ class VideoSource:
 
     def _decode_to(self, index: int, where: str) -> None:
         key = self._index.key[index]
-        if index < self._next or key > self._next:
+        if index < self._next or key > self._next + _NEAR:
             self._start_at(key, where)
-        while self._next <= index and self._step():
+        while self._next <= self._index.reach[index] and self._step():
             pass
 
     def _start_at(self, key: int, where: str) -> None:
         """Go to key frame `key`. Where a container seeks badly: to the one before, or to the start."""
         self._floor = self._next = key
+        self._fresh.clear()
         keys = self._index.keys
         before = keys[max(bisect_left(keys, key) - 1, 0)] if keys else 0
         container = self._opened(where)
@@ -167,6 +173,7 @@ class VideoSource:
             packet = next(self._packets)
         except (StopIteration, FFmpegError):
             self._next = len(self._index.pts)
+            self._release()
             return False
         try:
             frames: Any = packet.decode()
@@ -184,7 +191,14 @@ class VideoSource:
         if frame.is_corrupt:
             self._note_damage(entry)
         self._next = max(self._next, entry + 1)
-        self._kept[entry] = frame
+        self._fresh[entry] = frame
+        self._release()
+
+    def _release(self) -> None:
+        """Make ready the frames for which all that they may build on has come out, damaged or not."""
+        ready = [entry for entry in self._fresh if self._index.reach[entry] < self._next]
+        for entry in ready:
+            self._kept[entry] = self._fresh.pop(entry)
         while len(self._kept) > self._kept_frames:
             self._kept.popitem(last=False)
 
@@ -203,8 +217,11 @@ class VideoSource:
                 self._container = _open_container(self.name)
             except InputError as error:
                 raise FrameError(error.what, where=where, hint=error.hint) from error
-            # a decoder left to itself paints over damage
-            self._container.streams.video[0].codec_context.options = {"err_detect": "explode"}
+            codec = self._container.streams.video[0].codec_context
+            if codec.name not in ("h264", "hevc"):
+                # Decoders paint over damage, most without saying so unless told to stop. h264 and hevc do
+                # say so, and would stop for nothing after a seek into an open group of pictures.
+                codec.options = {"err_detect": "crccheck+explode"}
         return self._container
 
 
@@ -278,9 +295,14 @@ def _index(
     position = [positions[p] for p in pts]
     keys = [i for i, at in enumerate(position) if rows[at].key]
     key = [keys[bisect_right(keys, i) - 1] if keys and keys[0] <= i else 0 for i in range(len(pts))]
+    reach, furthest = [0] * len(pts), 0
+    for i in sorted(range(len(pts)), key=position.__getitem__):
+        reach[i] = furthest = max(furthest, i)
     damaged = [i for i, at in enumerate(position) if rows[at].damaged]
     same_time = len(rows) - len(pts)
-    return _Index(pts, position, key, keys, damaged, time_base, missing, others + same_time, frame_bytes)
+    return _Index(
+        pts, position, key, reach, keys, damaged, time_base, missing, others + same_time, frame_bytes
+    )
 
 
 def _entries(spec: str, index: _Index) -> list[Entry]:

@@ -269,12 +269,12 @@ def test_no_output_named(fusion: Fusion, tmp_path: Path) -> None:
 
 
 def test_an_unregistered_data_set_needs_a_registration(fusion: Fusion, tmp_path: Path) -> None:
-    root = tmp_path / "ir_det_dataset" / "Images"
-    rgb, fir = write_pairs(root, 2)
-    top = tmp_path
-    one_line(fusion("blend", "--dataset", "mil_multispectral", top, "-o", tmp_path / "out"), "mil_multispectral", "--homography")
+    root = tmp_path / "set" / "ir_det_dataset" / "Images"
+    write_pairs(root, 2)
+    top, out = tmp_path / "set", tmp_path / "out"
+    one_line(fusion("blend", "--dataset", "mil_multispectral", top, "-o", out), "mil_multispectral", "--homography")
     (tmp_path / "H.txt").write_text("1 0 1\n0 1 1\n0 0 1\n")
-    answer = fusion("blend", "--dataset", "mil_multispectral", top, "-o", f"{tmp_path}-out", "--homography", tmp_path / "H.txt")
+    answer = fusion("blend", "--dataset", "mil_multispectral", top, "-o", out, "--homography", tmp_path / "H.txt")
     assert answer.code == 0, answer.err
 
 
@@ -321,7 +321,7 @@ def test_real_radiometric_counts(fusion: Fusion, tmp_path: Path, shared_data: Pa
     answer = fusion("blend", rgb, tiff, "-o", tmp_path / "c", "--window", 0, 8, "--window-unit", "celsius", *scale)
     assert answer.code == 0, answer.err
     row = (tmp_path / "c/frames.csv").read_text().splitlines()[1].split(",")
-    assert (float(row[6]), float(row[7])) == (273.15 / 0.04, 281.15 / 0.04)
+    assert (float(row[6]), float(row[7])) == pytest.approx((273.15 / 0.04, 281.15 / 0.04), rel=1e-9)
     answer = fusion("blend", rgb, tiff, "-o", tmp_path / "a")
     assert answer.code == 0
     assert np.unique(read(tmp_path / "a/fused/scene.png").reshape(-1, 3), axis=0).shape[0] > 100
