@@ -57,7 +57,7 @@ def index_counts(
         raise ValueError(f"expected a finite window lo < hi, got {lo} and {hi}")
     if counts.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"expected counts of uint8 or uint16, got {counts.dtype}")
-    counts = _checked("counts", counts, counts.dtype, (None, None))
+    counts = checked("counts", counts, counts.dtype, (None, None))
     first, table = _window_table(float(lo), float(hi), 255 if counts.dtype == np.uint8 else 65535)
     index = np.empty(counts.shape, np.uint8)
     below, above = _look_up_counts(_flat(counts), first, table, index.reshape(-1))
@@ -92,9 +92,9 @@ def resample(
     (H x W uint8, contiguous, not overlapping the inputs) or a new array, and returns it. Raises
     `ValueError` where an offset lies outside the image; `out` is then undefined.
     """
-    image = _checked("image", image, np.uint8, (None, None))
-    offset = _checked("offset", offset, np.uint32, (None, None))
-    fraction = _checked("fraction", fraction, np.uint16, offset.shape)
+    image = checked("image", image, np.uint8, (None, None))
+    offset = checked("offset", offset, np.uint32, (None, None))
+    fraction = checked("fraction", fraction, np.uint16, offset.shape)
     if image.size >= 1 << 31:
         raise ValueError(f"the image has too many pixels to be addressed: {image.shape}")
     if out is None:
@@ -123,11 +123,11 @@ def blend_indexed(
     """
     if not 0 <= alpha <= 1:
         raise ValueError(f"expected alpha in [0, 1], got {alpha}")
-    bgr = _checked("bgr", bgr, np.uint8, (None, None, 3))
-    index = _checked("index", index, np.uint8, bgr.shape[:2])
+    bgr = checked("bgr", bgr, np.uint8, (None, None, 3))
+    index = checked("index", index, np.uint8, bgr.shape[:2])
     words = np.zeros((256, 4), np.uint8)
-    words[:, :3] = _checked("table_bgr", table_bgr, np.uint8, (256, 3))
-    seen = index if mask is None else _checked("mask", mask, np.uint8, bgr.shape[:2])
+    words[:, :3] = checked("table_bgr", table_bgr, np.uint8, (256, 3))
+    seen = index if mask is None else checked("mask", mask, np.uint8, bgr.shape[:2])
     out = np.empty(bgr.shape, np.uint8)
     _blend(
         _flat(bgr),
@@ -149,7 +149,7 @@ def _digits(alpha: float) -> tuple[np.int16, np.int16, np.int16]:
     return np.int16(units >> 14), np.int16(units >> 7 & 127), np.int16(units & 127)
 
 
-def _checked(name: str, array: NDArray[Any], dtype: DTypeLike, shape: tuple[int | None, ...]) -> NDArray[Any]:
+def checked(name: str, array: NDArray[Any], dtype: DTypeLike, shape: tuple[int | None, ...]) -> NDArray[Any]:
     """`array`, contiguous and aligned, if it has this type and shape (None: any size but 0)."""
     given = array.shape
     fits = len(given) == len(shape) and all(n == m if m else n > 0 for n, m in zip(given, shape, strict=True))

@@ -37,6 +37,7 @@ _GOOD_MATRIX = (
 _GOOD_POINTS = f"a CSV whose first line is {','.join(COLUMNS)} and then one pair of pixels a line"
 _LARGEST_COORDINATE = 1e7
 _LEAST_COVERAGE = 0.1
+_INSIDE_OUT = "the point pairs turn the image inside out: some rows are mixed up"
 # Second-smallest singular value of the linear system over its largest. Floats spread over an image give
 # 0.02 to 0.3; points on a line but one, with 0.3 px of noise, stay below this.
 _LEAST_DETERMINACY = 2e-3
@@ -182,7 +183,7 @@ def _fit_least_squares(src: Floats, dst: Floats) -> tuple[Floats, Floats]:
     p, q = _project(to_src, src), _project(to_dst, dst)
     matrix = _linear(p, q)
     if not _in_front(matrix, p):
-        raise _DegenerateError("the point pairs turn the image inside out: some rows are mixed up")
+        raise _DegenerateError(_INSIDE_OUT)
     error, slope = _linearised(matrix, p, q)
     for _ in range(20):  # Gauss-Newton; the linear start is close, so it is never damped, only stopped
         step = np.append(np.linalg.lstsq(slope, error, rcond=None)[0], 0.0).reshape(3, 3)
@@ -247,8 +248,8 @@ def _linear(p: Floats, q: Floats) -> Floats:
     if values[7] < _LEAST_DETERMINACY * values[0]:
         raise _DegenerateError("the point pairs determine no homography: too many on one line or spot")
     matrix = rows[8].reshape(3, 3)
-    if abs(matrix[2, 2]) < 1e-9:
-        raise _DegenerateError("the point pairs send the middle of the image to infinity")
+    if abs(matrix[2, 2]) < 1e-9:  # the middle of the points would lie on the horizon
+        raise _DegenerateError(_INSIDE_OUT)
     return matrix / matrix[2, 2]
 
 
@@ -473,7 +474,9 @@ def check(registration: Registration, fir_size_wh: Size, rgb_size_wh: Size) -> l
     if np.linalg.det(H) < 0:
         notes.append("the homography mirrors the thermal image")
     if share < _LEAST_COVERAGE:
-        notes.append(f"thermal covers only {share:.2%} of RGB" + (f": {advice}" if advice else ""))
+        notes.append(
+            f"thermal covers only {share:.2%} of RGB" + (f"; if more is meant: {advice}" if advice else "")
+        )
     return notes
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol
 
 from fusion.frames import FrameSet, Image
-from fusion.pairing import Pairing, PairingRule, pair
+from fusion.pairing import Pairing, PairingRule, pair, stamps_of
 from fusion.sources import open_source
 from fusion.sources.base import Entry, Source
 from fusion.sources.channels import RgbtFiles, open_rgbt
@@ -48,6 +49,9 @@ class PairedSources:
         self.name = f"{rgb.name} + {fir.name}"
         self.pairing = pair(rgb.entries, fir.entries, rule)
         self._rgb, self._fir = rgb, fir
+        by_time = self.pairing.rule_by == "stamp"  # the stamps may stand in the names alone
+        self._rgb_stamps = stamps_of(rgb.entries, rule.rgb_key) if by_time else None
+        self._fir_stamps = stamps_of(fir.entries, rule.fir_key) if by_time else None
 
     def __len__(self) -> int:
         return len(self.pairing.pairs)
@@ -61,10 +65,11 @@ class PairedSources:
         return rgb.stem, fir.stem
 
     def read(self, index: int) -> FrameSet:
-        return FrameSet(self._rgb.read(self.pairing.pairs[index][0]), self.read_fir(index))
+        rgb = _read(self._rgb, self.pairing.pairs[index].rgb, self._rgb_stamps)
+        return FrameSet(rgb, self.read_fir(index))
 
     def read_fir(self, index: int) -> Image:
-        return self._fir.read(self.pairing.pairs[index][1])
+        return _read(self._fir, self.pairing.pairs[index].fir, self._fir_stamps)
 
     def changed_ns(self, index: int) -> int:
         return _changed_ns(self._entries(index))
@@ -119,6 +124,11 @@ def open_pairs(
     rgb_source = open_source(rgb, "rgb")
     fir_source = open_source(fir, "fir", fir_colour=fir_colour)
     return PairedSources(rgb_source, fir_source, rule or PairingRule())
+
+
+def _read(source: Source, index: int, stamps: Sequence[int | None] | None) -> Image:
+    image = source.read(index)
+    return image if stamps is None else replace(image, stamp_ns=stamps[index])
 
 
 def _changed_ns(entries: Sequence[Entry]) -> int:

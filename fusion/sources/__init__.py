@@ -29,14 +29,16 @@ def open_source(
     knows the spec.
     """
     text = str(spec)
+    if not text.strip():
+        raise InputError("no source given", hint="give a folder, an image, a video or a glob pattern")
     expected = []
     for kind in _kinds():
-        if kind.accepts(text):
+        if _accepts(kind, text):
             return kind.open(text, role, fir_colour=fir_colour, max_pixels=max_pixels)
         expected.append(kind.expects)
     if not Path(text).exists():
         hint = f"give {', '.join(expected)}; {_nearest_folder(Path(text))}"
-        raise InputError("no such file or folder", where=text or "''", hint=hint)
+        raise InputError("no such file or folder", where=text, hint=hint)
     raise InputError("not a source of images", where=text, hint=f"give {', '.join(expected)}")
 
 
@@ -48,8 +50,18 @@ def _kinds() -> Iterator[SourceKind]:
         yield point.load()
 
 
+def _accepts(kind: SourceKind, text: str) -> bool:
+    try:
+        return kind.accepts(text)
+    except (OSError, ValueError) as error:  # no permission, a name too long, a zero byte
+        raise InputError(f"cannot be looked up: {error}", where=text) from error
+
+
 def _nearest_folder(path: Path) -> str:
     """Says up to where a path that is not there does exist."""
     there = next((parent for parent in path.absolute().parents if parent.is_dir()), Path("/"))
-    names = sorted(p.name for p in there.iterdir() if not p.name.startswith("."))[:5]
+    try:
+        names = sorted(p.name for p in there.iterdir() if not p.name.startswith("."))[:5]
+    except OSError:
+        return f"{there} cannot be listed"
     return f"{there} holds {', '.join(names)}" if names else f"{there} is empty"

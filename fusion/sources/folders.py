@@ -113,7 +113,11 @@ def list_pattern(pattern: str) -> tuple[list[Entry], int]:
 def split_pattern(pattern: str) -> tuple[Path, str]:
     """The folder in front of the first wildcard, and the rest of the pattern."""
     parts = Path(pattern).parts
-    first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
+    first = 0
+    while first < len(parts) - 1 and (
+        not glob.has_magic(parts[first]) or Path(*parts[: first + 1]).exists()  # a name with brackets
+    ):
+        first += 1
     return Path(*parts[:first]), "/".join(parts[first:])
 
 

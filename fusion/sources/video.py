@@ -72,8 +72,8 @@ class VideoSource:
     noted in the container is not applied. `ignored` counts further video streams and frames that share
     their time with another. `read` may be called from several threads: requests that come nearly in
     order share one forward pass. A frame that is damaged, that builds on a damaged one, or that the
-    container announces but does not hold, raises `FrameError`; whatever the order of reading, the same
-    frames do.
+    container announces but does not hold, raises `FrameError`, whatever the order of reading. Damage that
+    the decoder itself does not report (ffv1 and vp9 mend it in silence) cannot be seen here.
     """
 
     def __init__(self, spec: str, role: Role, *, fir_colour: FirColour, max_pixels: int) -> None:
@@ -221,7 +221,7 @@ class VideoSource:
             if codec.name not in ("h264", "hevc"):
                 # Decoders paint over damage, most without saying so unless told to stop. h264 and hevc do
                 # say so, and would stop for nothing after a seek into an open group of pictures.
-                codec.options = {"err_detect": "crccheck+explode"}
+                codec.options = {"err_detect": "explode"}
         return self._container
 
 

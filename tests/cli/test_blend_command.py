@@ -271,7 +271,7 @@ def test_no_output_named(fusion: Fusion, tmp_path: Path) -> None:
 def test_an_unregistered_data_set_needs_a_registration(fusion: Fusion, tmp_path: Path) -> None:
     root = tmp_path / "set" / "ir_det_dataset" / "Images"
     write_pairs(root, 2)
-    top, out = tmp_path / "set", tmp_path / "out"
+    top, out = tmp_path / "set" / "ir_det_dataset", tmp_path / "out"
     one_line(fusion("blend", "--dataset", "mil_multispectral", top, "-o", out), "mil_multispectral", "--homography")
     (tmp_path / "H.txt").write_text("1 0 1\n0 1 1\n0 0 1\n")
     answer = fusion("blend", "--dataset", "mil_multispectral", top, "-o", out, "--homography", tmp_path / "H.txt")
