@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from fusion.kernels import blend_indexed, checked
 from fusion.tables import lookup
+
+_Band = NDArray[Any]  # what OpenCV takes and gives, H x W x 3; float32 unless said otherwise
 
 _LEVELS = 5
 _SMALLEST_SIDE = 16  # pixels: no level is made of an image that is narrower
@@ -55,20 +57,20 @@ def blend_laplacian(
         raise ValueError(f"expected alpha in [0, 1], got {alpha}")
     rgb = checked("bgr", bgr, np.uint8, (None, None, 3))
     index = checked("index", index, np.uint8, rgb.shape[:2])
-    thermal = checked("table_bgr", table_bgr, np.uint8, (256, 3)).take(index, axis=0)
+    thermal: _Band = checked("table_bgr", table_bgr, np.uint8, (256, 3)).take(index, axis=0)
     outside = None if mask is None else (checked("mask", mask, np.uint8, rgb.shape[:2]) == 0).astype(np.uint8)
     if outside is not None:
         thermal = cv2.copyTo(rgb, outside, thermal)
     first, second = _pyramid(rgb), _pyramid(thermal)
-    merged = cv2.addWeighted(first.pop(), alpha, second.pop(), 1 - alpha, 0)
+    merged: _Band = cv2.addWeighted(first.pop(), alpha, second.pop(), 1 - alpha, 0)
     while first:
         detail = _stronger(first.pop() * min(1.0, 2 * alpha), second.pop() * min(1.0, 2 - 2 * alpha))
         merged = _expanded(merged, detail.shape) + detail
-    fused = np.clip(np.floor(merged + np.float32(0.5)), 0, 255).astype(np.uint8)
+    fused: _Band = np.clip(np.floor(merged + np.float32(0.5)), 0, 255).astype(np.uint8)
     return fused if outside is None else cv2.copyTo(rgb, outside, fused)
 
 
-def _pyramid(pixels: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+def _pyramid(pixels: _Band) -> list[_Band]:
     """Detail bands from fine to coarse, and last the base that is left; float32, H x W x 3."""
     bands, rest = [], pixels.astype(np.float32)
     while len(bands) < _LEVELS and min(rest.shape[:2]) >= _SMALLEST_SIDE:
@@ -78,17 +80,17 @@ def _pyramid(pixels: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
     return [*bands, rest]
 
 
-def _expanded(coarse: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _expanded(coarse: _Band, shape: tuple[int, ...]) -> _Band:
     return cv2.pyrUp(coarse, dstsize=(shape[1], shape[0]))
 
 
-def _stronger(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+def _stronger(first: _Band, second: _Band) -> _Band:
     """Of each pixel's two coefficient vectors the longer one; the first of equals."""
     wins = _squared_length(second) > _squared_length(first)
     return cv2.copyTo(second, wins.astype(np.uint8), first.copy())
 
 
-def _squared_length(band: NDArray[np.float32]) -> NDArray[np.float32]:
+def _squared_length(band: _Band) -> _Band:
     b, g, r = cv2.split(band)
     return b * b + g * g + r * r
 

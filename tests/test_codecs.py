@@ -328,7 +328,8 @@ def test_bytes_after_the_end_of_a_png_are_harmless() -> None:
 def whole_files() -> dict[str, bytes]:
     grey, bgr, counts = ramp(), ramp((3,)), ramp((), np.uint16)
     webp = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, 80])[1].tobytes()
-    text = b"P2 60 40 255\n" + b" ".join(b"%d" % v for v in grey.ravel())
+    # a text file cut inside its very last number cannot be told from a whole one: one digit there
+    text = b"P2 60 40 255\n" + b" ".join(b"%d" % v for v in [*grey.ravel()[:-1], 7])
     return {
         "png8": by_pillow(grey, "PNG"),
         "png24": encode_png(bgr),
@@ -363,24 +364,24 @@ def test_no_truncated_file_gives_a_partial_image(name) -> None:
         *range(1, 45),
         *range(len(data) - 6, len(data)),
     }
-    refused = 0
+    refused = []
     for cut in sorted(cuts):
         try:
             pixels = decode_image(data[:cut], name)
         except FrameError as error:
-            refused += 1
-            assert name in str(error)
+            refused.append(str(error))
         else:
             # the very end of a file may hold nothing of the picture
             assert same(pixels, full), f"{name} cut to {cut} of {len(data)} bytes"
-    assert refused >= len(cuts) - 6
+    assert len(refused) >= len(cuts) - 6
+    assert all(text.startswith(f"{name}: ") for text in refused)
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_flipped_bits_never_end_in_another_error(name) -> None:
     data, generator = FILES[name], np.random.default_rng(11)
     full, differing = decode_image(data, name), 0
-    for at in [*generator.integers(0, 64, 40), *generator.integers(0, len(data), 40)]:
+    for at in [*generator.integers(0, 64, 25), *generator.integers(0, len(data), 20)]:
         broken = bytearray(data)
         broken[at] ^= 1 << int(generator.integers(8))
         try:
