@@ -67,7 +67,9 @@ def blend_laplacian(
         detail = _stronger(first.pop() * min(1.0, 2 * alpha), second.pop() * min(1.0, 2 - 2 * alpha))
         merged = _expanded(merged, detail.shape) + detail
     fused: _Band = np.clip(np.floor(merged + np.float32(0.5)), 0, 255).astype(np.uint8)
-    return fused if outside is None else cv2.copyTo(rgb, outside, fused)
+    if outside is not None:
+        fused = cv2.copyTo(rgb, outside, fused)
+    return fused
 
 
 def _pyramid(pixels: _Band) -> list[_Band]:

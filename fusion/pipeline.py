@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from fusion import registration as reg
 from fusion.blend import blender
 from fusion.colormaps import colormap_bgr
 from fusion.config import BlendConfig
-from fusion.errors import FrameError, InputError
+from fusion.errors import FrameError, InputError, UsageError
 from fusion.frames import FrameSet, FusedFrame, Window
 from fusion.kernels import index_counts
 from fusion.sync import Pairs
@@ -82,11 +81,6 @@ class Fuser:
                 if self.config.strict:
                     raise
                 self.skipped.append(error)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """What the user should know of the registration before the first frame is written."""
-        return tuple(self.registration.notes)
 
     @property
     def size_groups(self) -> int:
@@ -176,9 +170,16 @@ class Fuser:
             registration = reg.identity(rgb_size_wh)
         else:
             registration = reg.scale_to_fit(fir_size_wh, rgb_size_wh)
-        notes = reg.check(registration, fir_size_wh, rgb_size_wh)
+        notes = self._checked(registration, fir_size_wh, rgb_size_wh)
         registration = replace(registration, notes=(*registration.notes, *notes))
         return registration, Warp(registration.H_rgb_fir, fir_size_wh, rgb_size_wh)
+
+    def _checked(self, registration: reg.Registration, *sizes: tuple[int, int]) -> list[str]:
+        try:
+            return reg.check(registration, *sizes)
+        except UsageError as error:
+            given = self.config.warp.homography or self.config.warp.points
+            raise UsageError(error.what, where=given or error.where, hint=error.hint) from None
 
 
 def _flags(frames: FrameSet, window: Window) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ def _registration(fuser: Fuser) -> dict[str, Any]:
         record["fit"] = {
             "points": fit.count,
             "inliers": fit.inliers,
-            "outlier_rows": list(fit.outlier_rows),
+            "outlier_pairs": [row + 1 for row in fit.outlier_rows],
             "rms_px": round(fit.rms_px, 6),
             "max_px": round(fit.max_px, 6),
         }

@@ -193,7 +193,7 @@ def test_resample_refuses_an_out_that_overlaps_or_does_not_fit() -> None:
 def test_resample_refuses_other_types_and_shapes(position: int, wrong: NDArray) -> None:
     arguments: list[Any] = [np.zeros((4, 4), t) for t in (np.uint8, np.uint32, np.uint16)]
     arguments[position] = wrong
-    with pytest.raises(ValueError, match="expected n x n|expected 4 x 4"):
+    with pytest.raises(ValueError, match=r"expected (n|4) x (n|4) uint"):
         resample(*arguments)
 
 
@@ -278,7 +278,7 @@ def test_blend_at_the_ends_gives_the_images_themselves() -> None:
 def test_blend_refuses_other_types_shapes_and_alphas(position: int, wrong: Any) -> None:
     arguments: list[Any] = [*(np.zeros(s, np.uint8) for s in ((4, 5, 3), (4, 5), (256, 3))), 0.5, None]
     arguments[position] = wrong
-    with pytest.raises(ValueError, match="expected (alpha|[n0-9])"):
+    with pytest.raises(ValueError, match=r"expected (alpha|n|4|256) "):
         blend_indexed(*arguments)
 
 

@@ -27,7 +27,7 @@ def plan_lines(fuser: Fuser) -> list[str]:
         rows.append(("border", f"left {left}, top {top}, right {right}, bottom {bottom} px"))
         rows.append(("outside", f"crop to {width}x{height} at ({x}, {y})" if config.warp.outside == "crop" else config.warp.outside))
     rows.append(("preset", f"{config.preset}: colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}"))
-    return [*_table(rows), *(f"note: {note}" for note in (*fuser.registration.notes, *pairing.notes))]
+    return [*_table(rows), *(f"note: {note}" for note in pairing.notes)]
 
 
 def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
@@ -50,7 +50,8 @@ def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
 
 def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
     """What the user should act on, a line each."""
-    warnings = [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
+    warnings = list(fuser.registration.notes)
+    warnings += [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
     if len(report.skipped) > LOUD_SKIPS:
         warnings.append(f"… and {len(report.skipped) - LOUD_SKIPS} more, all named in frames.csv")
     if fuser.pairs.pairing.unmatched:
@@ -65,9 +66,9 @@ def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
 def _registration(fuser: Fuser) -> str:
     registration, fit = fuser.registration, fuser.registration.fit
     if fit is None:
-        return registration.kind
+        return "none: scaled to fit" if registration.kind == "scale" else registration.kind
     text = f"{fit.inliers} of {fit.count} points, rms {fit.rms_px:.2f} px, largest {fit.max_px:.2f} px"
-    return text + (f", left out {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else "")
+    return text + (f", left out median {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else "")
 
 
 def _span(span: tuple[float, float] | None) -> str:

@@ -93,7 +93,7 @@ class VideoSource:
         self._container: InputContainer | None = None
         self._packets: Iterator[Packet] = iter(())
         self._floor = 0  # frames before it come without what they build on, and are not kept
-        self._next = len(index.pts)  # the entry that decoding on would give: none before the first seek
+        self._next = 0  # the entry that decoding on would give
         self._damaged: set[int] = set()
         for entry in index.damaged:
             self._note_damage(entry)
@@ -112,7 +112,7 @@ class VideoSource:
         with self._lock:
             if self._container is not None:
                 self._container.close()
-            self._container, self._packets, self._next = None, iter(()), len(self._index.pts)
+            self._container, self._packets = None, iter(())
             self._kept.clear()
             self._fresh.clear()
 
@@ -130,25 +130,22 @@ class VideoSource:
         return self._kept[index]
 
     def _decode_to(self, index: int, where: str) -> None:
+        container = self._container or self._open_at_start(where)
         key = self._index.key[index]
         if index < self._next or key > self._next + _NEAR:
-            self._start_at(key, where)
+            self._go_to(key, container, where)
         while self._next <= self._index.reach[index] and self._step():
             pass
 
-    def _start_at(self, key: int, where: str) -> None:
+    def _go_to(self, key: int, container: InputContainer, where: str) -> None:
         """Go to key frame `key`. Where a container seeks badly: to the one before, or to the start."""
         self._floor = self._next = key
         self._fresh.clear()
         keys = self._index.keys
         before = keys[max(bisect_left(keys, key) - 1, 0)] if keys else 0
-        container = self._opened(where)
-        if any(self._seek(container, entry, key) for entry in dict.fromkeys((key, before))):
-            return
-        container.close()
-        self._container = None
-        container = self._opened(where)
-        self._packets = container.demux(container.streams.video[0])
+        if not any(self._seek(container, entry, key) for entry in dict.fromkeys((key, before))):
+            container.close()
+            self._open_at_start(where)
 
     def _seek(self, container: InputContainer, entry: int, key: int) -> bool:
         """Seek to `entry`; False when the packets that follow do not begin at or before `key`."""
@@ -211,18 +208,19 @@ class VideoSource:
         end = following[0] if following else len(at.pts)
         self._damaged.update(i for i in range(end) if at.position[i] >= at.position[entry])
 
-    def _opened(self, where: str) -> InputContainer:
-        if self._container is None:
-            try:
-                self._container = _open_container(self.name)
-            except InputError as error:
-                raise FrameError(error.what, where=where, hint=error.hint) from error
-            codec = self._container.streams.video[0].codec_context
-            if codec.name not in ("h264", "hevc"):
-                # Decoders paint over damage, most without saying so unless told to stop. h264 and hevc do
-                # say so, and would stop for nothing after a seek into an open group of pictures.
-                codec.options = {"err_detect": "explode"}
-        return self._container
+    def _open_at_start(self, where: str) -> InputContainer:
+        try:
+            self._container = container = _open_container(self.name)
+        except InputError as error:
+            raise FrameError(error.what, where=where, hint=error.hint) from error
+        stream = container.streams.video[0]
+        if stream.codec_context.name not in ("h264", "hevc"):
+            # Decoders paint over damage, most without saying so unless told to stop. h264 and hevc do say
+            # so, and would stop for nothing after a seek into an open group of pictures.
+            stream.codec_context.options = {"err_detect": "explode"}
+        self._floor = self._next = 0
+        self._packets = container.demux(stream)
+        return container
 
 
 def _open_container(spec: str) -> InputContainer:

@@ -37,7 +37,7 @@ def test_blend_writes_what_the_readme_says(fusion: Fusion, tmp_path: Path) -> No
     assert answer.code == 0, answer.err
     names = tree(tmp_path / "out")
     assert sorted(names) == ["frames.csv", *(f"fused/f{i:03d}.png" for i in range(5)), "preview.png", "run.toml"]
-    assert "no registration" in answer.out.lower()  # 50x40 onto 64x48 is scaled to fit, said loudly
+    assert "NOT REGISTERED" in answer.err  # 50x40 onto 64x48 is scaled to fit, said loudly
     run = tomllib.loads(names["run.toml"].decode())
     assert run["config"]["preset"] == "auto"
     assert run["registration"]["kind"] == "scale"

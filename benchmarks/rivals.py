@@ -1,0 +1,211 @@
+"""The same job by ffmpeg and ImageMagick: commands, their tuning, and a check that they do the same job.
+
+Both get what suits them best: registered pairs of equal size, a fixed window, files numbered from 0.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from content import Case
+from timing import clocked
+
+from fusion.colormaps import colormap_bgr
+
+FFMPEG = shutil.which("ffmpeg")
+# Debian's name first: "convert" may be anything
+MAGICK = shutil.which("convert-im6.q16") or shutil.which("convert")
+ALPHA = 0.85
+ALL_MEANS_SHARE = 255 * (1 - ALPHA)
+
+
+@dataclass(frozen=True, slots=True)
+class Ffmpeg:
+    """One way of telling ffmpeg what to do; `output` are the encoder's options."""
+
+    graph: str
+    output: tuple[str, ...]
+    decode_threads: int = 2
+    encode_threads: int = 2
+    filter_threads: int = 2
+
+    def command(self, pairs: Path, out: Path, case: Case, count: int, suffix: str) -> list[str]:
+        source = ["-threads", str(self.decode_threads), "-framerate", "25", "-start_number", "0"]
+        return [
+            *(FFMPEG or "ffmpeg", "-nostdin", "-v", "error", "-y"),
+            *("-filter_complex_threads", str(self.filter_threads)),
+            *(*source, "-i", str(pairs / f"rgb/%06d{suffix}"), *source, "-i", str(pairs / f"fir/%06d{suffix}")),
+            *("-filter_complex", GRAPHS[self.graph].format(**expressions(case))),
+            *("-frames:v", str(count), "-fps_mode", "passthrough", "-start_number", "0"),
+            *(*self.output, "-threads", str(self.encode_threads), str(out / f"%06d{suffix}")),
+        ]
+
+    @property
+    def words(self) -> str:
+        threads = f"threads {self.decode_threads}/{self.filter_threads}/{self.encode_threads}"
+        return f"{self.graph}; {' '.join(self.output)}; {threads} (decode/filter/encode)"
+
+
+# The window and the colour map are one table each for red, green and blue. {index} windows 16-bit counts to 8 bit.
+GRAPHS = {
+    # alpha blend as such
+    "lutrgb + blend=normal": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];"
+    "[r][t]blend=all_mode=normal:all_opacity=0.85",
+    "lutrgb + mix": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];[r][t]mix=weights='0.85 0.15'",
+    "lutrgb with alpha + overlay": "[0:v]format=gbrp[r];[1:v]{index}format=gbrap,lutrgb={colour}:a=38[t];"
+    "[r][t]overlay=format=gbrp",
+    # the weights in the tables, the sum in SIMD
+    "lutrgb x2 + blend=addition, planar": "[0:v]format=gbrp,lutrgb={weighted}[r];"
+    "[1:v]{index}format=gbrp,lutrgb={share}[t];[r][t]blend=all_mode=addition",
+    "lutrgb x2 + blend=addition, packed": "[0:v]format=rgb24,lutrgb={weighted}[r];"
+    "[1:v]{index}format=rgb24,lutrgb={share}[t];[r][t]blend=all_mode=addition",
+    # window, colours and blend in one table of 256 x 256 a channel
+    "lut2": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp[t];[r][t]lut2={table}",
+}
+PNG_OUTPUTS = tuple(
+    ("-c:v", "png", "-compression_level", level, "-pred", pred)
+    for level, pred in (("1", "sub"), ("1", "up"), ("1", "avg"), ("1", "paeth"), ("1", "none"))
+)
+PNG_STORED = ("-c:v", "png", "-compression_level", "0", "-pred", "none")
+
+
+def expressions(case: Case) -> dict[str, str]:
+    """The window and the map `hsv-cold-hot` as ffmpeg expressions: hue from 4/6 (blue) down to 0 (red)."""
+    lo, hi = case.window if case.bits == 8 else (0, 255)
+
+    def channels(value: str) -> dict[str, str]:
+        sixths = f"4*(1-clip(({value}-{lo})/{hi - lo},0,1))"
+        return {
+            "r": f"clip(2-{sixths},0,1)",
+            "g": f"clip(min({sixths},4-{sixths}),0,1)",
+            "b": f"clip({sixths}-2,0,1)",
+        }
+
+    of_val, of_y = channels("val"), channels("y")
+    table = [f"c{i}='floor({ALPHA}*x+{ALL_MEANS_SHARE}*{of_y[c]}+0.5)'" for i, c in enumerate("gbr")]
+    return {
+        "index": _index_16(case) if case.bits == 16 else "format=gray,",
+        "colour": ":".join(f"{c}='round(255*{of_val[c]})'" for c in "rgb"),
+        "share": ":".join(f"{c}='round({ALL_MEANS_SHARE}*{of_val[c]})'" for c in "rgb"),
+        "weighted": ":".join(f"{c}='round({ALPHA}*val)'" for c in "rgb"),
+        "table": ":".join(table),
+    }
+
+
+def _index_16(case: Case) -> str:
+    lo, hi = case.window
+    return f"format=gray16,lut=y='256*round(255*clip((val-{lo})/{hi - lo},0,1))',format=gray,"
+
+
+def tune(pairs: Path, out: Path, case: Case, count: int, suffix: str, outputs: Sequence[tuple[str, ...]]) -> list[tuple[Ffmpeg, float]]:
+    """Try graphs, then encoder options, then threads, each with the best so far; the fastest first."""
+    tried: dict[Ffmpeg, float] = {}
+
+    def fastest(candidates: Sequence[Ffmpeg]) -> Ffmpeg:
+        for candidate in candidates:
+            if candidate not in tried:
+                tried[candidate] = min(run_ffmpeg(candidate, pairs, out, case, count, suffix) for _ in range(2))
+        return min(candidates, key=lambda candidate: tried[candidate])
+
+    best = fastest([Ffmpeg(graph, outputs[0]) for graph in GRAPHS])
+    best = fastest([best, *(replace(best, output=output) for output in outputs[1:])])
+    best = fastest([best, replace(best, decode_threads=1), replace(best, encode_threads=3), replace(best, filter_threads=1)])
+    return sorted(tried.items(), key=lambda item: item[1])
+
+
+def run_ffmpeg(how: Ffmpeg, pairs: Path, out: Path, case: Case, count: int, suffix: str) -> float:
+    """Seconds of one run into the emptied folder `out`."""
+    return _into(out, count, suffix, [how.command(pairs, out, case, count, suffix)])
+
+
+# --- ImageMagick
+
+PNG_WRITE = "-define png:compression-level=1 -define png:compression-strategy=2 -define png:compression-filter=2"
+BLENDS = {
+    "blend": "-compose blend -define compose:args=15 -composite",
+    "plus": "-compose plus -composite",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Magick:
+    """One way of using ImageMagick: one process for each frame, or two processes with half of the frames each."""
+
+    process_per_frame: bool
+    blend: str
+    write: str = PNG_WRITE
+
+    @property
+    def words(self) -> str:
+        processes = "a process a frame, two at a time" if self.process_per_frame else "two processes, half of the frames each"
+        return f"{processes}; -clut; {BLENDS[self.blend]}; {self.write or 'default PNG settings'}"
+
+    def commands(self, pairs: Path, out: Path, case: Case, count: int) -> list[list[str]]:
+        step = 1 if self.process_per_frame else (count + 1) // 2
+        return [self._command(pairs, out, case, range(at, min(at + step, count))) for at in range(0, count, step)]
+
+    def _command(self, pairs: Path, out: Path, case: Case, frames: range) -> list[str]:
+        lo, hi = (limit * (257 if case.bits == 8 else 1) for limit in case.window)
+        clut = ["-level", f"{lo},{hi}", str(pairs / "palette.png"), "-clut"]
+        dim = ["-evaluate", "multiply", "0.85"], ["-evaluate", "multiply", "0.15"]
+        rgb_dim, fir_dim = dim if self.blend == "plus" else ([], [])
+        command = [MAGICK or "convert", "-limit", "thread", "1"]
+        for frame in frames:
+            rgb, fir = (str(pairs / f"{name}/{frame:06d}.png") for name in ("rgb", "fir"))
+            command += [rgb, *rgb_dim, "(", fir, *clut, *fir_dim, ")", *BLENDS[self.blend].split()]
+            command += ["-depth", "8", *self.write.split(), "-write", str(out / f"{frame:06d}.png"), "+delete"]
+        return [*command[:-1], "null:"]  # the last image stays: an empty list at the end is an error
+
+
+MAGICKS = tuple(Magick(single, blend) for single in (True, False) for blend in BLENDS) + (Magick(False, "blend", ""),)
+
+
+def run_magick(how: Magick, pairs: Path, out: Path, case: Case, count: int) -> float:
+    palette = pairs / "palette.png"
+    if not palette.exists():
+        cv2.imwrite(str(palette), colormap_bgr("hsv-cold-hot")[None])
+    return _into(out, count, ".png", how.commands(pairs, out, case, count))
+
+
+def tune_magick(pairs: Path, out: Path, case: Case, count: int) -> list[tuple[Magick, float]]:
+    tried = [(how, run_magick(how, pairs, out, case, count)) for how in MAGICKS]
+    return sorted(tried, key=lambda item: item[1])
+
+
+# --- both
+
+
+def _into(out: Path, count: int, suffix: str, commands: list[list[str]]) -> float:
+    """Run the commands, two at a time, and see that `count` files came out; seconds."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    with ThreadPoolExecutor(2) as pool:
+        seconds = clocked(lambda: [done for done in pool.map(_run, commands)])
+    made = len(list(out.glob(f"*{suffix}")))
+    if made != count:
+        raise RuntimeError(f"{commands[0][0]} made {made} of {count} files")
+    return seconds
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{command[0]} failed: {done.stderr.strip()[-500:]}")
+
+
+def mean_difference(ours: Path, theirs: Path, frames: int = 5) -> float:
+    """Mean absolute difference, in grey levels, of the first frames of two folders."""
+    suffix = next(ours.iterdir()).suffix
+    names = [f"{index:06d}{suffix}" for index in range(frames)]
+    pairs = [(cv2.imread(str(ours / name)), cv2.imread(str(theirs / name))) for name in names]
+    apart = [np.abs(a.astype(np.int16) - b) for a, b in pairs if a is not None and b is not None]
+    if len(apart) != len(names):
+        raise RuntimeError(f"{ours} and {theirs} lack some of {names}")
+    return float(np.mean(apart))
