@@ -35,7 +35,7 @@ lint: $(VENV)/ready
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/ready
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 notebooks: $(VENV)/ready
 	$(BIN)/python -m pytest --nbmake notebooks --nbmake-timeout=300 -p no:cacheprovider

@@ -127,7 +127,11 @@ def run_ffmpeg(how: Ffmpeg, pairs: Path, out: Path, case: Case, count: int, suff
 
 # --- ImageMagick
 
-PNG_WRITE = "-define png:compression-level=1 -define png:compression-strategy=2 -define png:compression-filter=2"
+PNG_WRITES = (
+    "-define png:compression-level=1 -define png:compression-strategy=2 -define png:compression-filter=2",
+    "-quality 12",  # level 1, filter 2 (up)
+    "",  # as it comes
+)
 BLENDS = {
     "blend": "-compose blend -define compose:args=15 -composite",
     "plus": "-compose plus -composite",
@@ -140,7 +144,7 @@ class Magick:
 
     process_per_frame: bool
     blend: str
-    write: str = PNG_WRITE
+    write: str = PNG_WRITES[0]
 
     @property
     def words(self) -> str:
@@ -164,7 +168,10 @@ class Magick:
         return [*command[:-1], "null:"]  # the last image stays: an empty list at the end is an error
 
 
-MAGICKS = tuple(Magick(single, blend) for single in (True, False) for blend in BLENDS) + (Magick(False, "blend", ""),)
+MAGICKS = (
+    *(Magick(single, blend) for single in (True, False) for blend in BLENDS),
+    *(Magick(False, "blend", write) for write in PNG_WRITES[1:]),
+)
 
 
 def run_magick(how: Magick, pairs: Path, out: Path, case: Case, count: int) -> float:

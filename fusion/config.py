@@ -125,7 +125,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(f"cannot be read as TOML: {error}", where=path) from None
     if settings.get("format") != FORMAT:
-        raise UsageError("no configuration of ours", where=path, hint=f'its first line must be format = "{FORMAT}"')
+        raise UsageError(
+            "no configuration of ours", where=path, hint=f'its first line must be format = "{FORMAT}"'
+        )
     for group, key in (("warp", "homography"), ("warp", "points"), ("pairing", "map")):
         table = settings.get(group)
         if isinstance(table, dict) and isinstance(table.get(key), str):
@@ -155,7 +157,9 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in over.items():
         known = merged.get(key)
-        merged[key] = _merged(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+        merged[key] = (
+            _merged(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
+        )
     return merged
 
 

@@ -34,4 +34,6 @@ def output_error(error: OSError, path: Path) -> OutputError:
     hint = "free some space and run the same command again: finished frames are kept"
     where = error.filename2 or error.filename or path
     full = error.errno in NO_SPACE
-    return OutputError(f"cannot be written: {error.strerror or error}", where=where, hint=hint if full else "")
+    return OutputError(
+        f"cannot be written: {error.strerror or error}", where=where, hint=hint if full else ""
+    )

@@ -100,4 +100,6 @@ class FusedFrame:
         if self.bgr.ndim != 3 or self.bgr.shape[2] != 3 or self.bgr.dtype != np.uint8:
             raise ValueError(f"bgr must be HxWx3 uint8, got {self.bgr.shape} {self.bgr.dtype}")
         if self.mask is not None and (self.mask.shape != self.bgr.shape[:2] or self.mask.dtype != np.uint8):
-            raise ValueError(f"mask must be {self.bgr.shape[:2]} uint8, got {self.mask.shape} {self.mask.dtype}")
+            raise ValueError(
+                f"mask must be {self.bgr.shape[:2]} uint8, got {self.mask.shape} {self.mask.dtype}"
+            )

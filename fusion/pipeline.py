@@ -150,7 +150,9 @@ class Fuser:
                 return frames.fir.size_wh, frames.rgb.size_wh
         raise InputError(f"none of {len(self.pairs)} pairs can be used; the first: {first_error}")
 
-    def _warp_for(self, fir_size_wh: tuple[int, int], rgb_size_wh: tuple[int, int]) -> tuple[reg.Registration, Warp]:
+    def _warp_for(
+        self, fir_size_wh: tuple[int, int], rgb_size_wh: tuple[int, int]
+    ) -> tuple[reg.Registration, Warp]:
         sizes = (fir_size_wh, rgb_size_wh)
         with self._lock:
             if sizes not in self._warps:
@@ -163,7 +165,9 @@ class Fuser:
                 self._warps[sizes] = self._build_warp(*sizes)
             return self._warps[sizes]
 
-    def _build_warp(self, fir_size_wh: tuple[int, int], rgb_size_wh: tuple[int, int]) -> tuple[reg.Registration, Warp]:
+    def _build_warp(
+        self, fir_size_wh: tuple[int, int], rgb_size_wh: tuple[int, int]
+    ) -> tuple[reg.Registration, Warp]:
         if self._given is not None:
             registration = self._given
         elif fir_size_wh == rgb_size_wh:

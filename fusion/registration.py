@@ -1,7 +1,8 @@
 """Where the thermal image lies on the RGB image: homographies read, fitted to points, and judged.
 
 `H_rgb_fir` takes thermal pixel coordinates to RGB pixel coordinates; pixel (0, 0) is the centre of the
-top-left pixel."""
+top-left pixel.
+"""
 
 from __future__ import annotations
 

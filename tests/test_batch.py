@@ -28,7 +28,13 @@ def fuse_to(out: Path, rgb: Path, fir: Path, *, workers: int = 1, **groups: obje
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path: Path) -> None:
     rgb, fir = write_pairs(tmp_path, 12, bits=16, fir_size_wh=(50, 40))
     for workers in (1, 2, 7):
-        fuse_to(tmp_path / str(workers), rgb, fir, workers=workers, thermal={"window": (2, 98), "window_unit": "percentile", "window_over": "running"})
+        fuse_to(
+            tmp_path / str(workers),
+            rgb,
+            fir,
+            workers=workers,
+            thermal={"window": (2, 98), "window_unit": "percentile", "window_over": "running"},
+        )
     assert tree(tmp_path / "1") == tree(tmp_path / "2") == tree(tmp_path / "7")
     assert len(tree(tmp_path / "1")) == 12 + 2
 
@@ -41,7 +47,14 @@ def test_unusable_frames_are_skipped_counted_and_named(tmp_path: Path) -> None:
     report = fuse_to(tmp_path / "out", rgb, fir)
     assert (report.fused, [stem for stem, _ in report.skipped]) == (4, ["f001", "f003"])
     rows = {row.stem: row for row in read_rows(tmp_path / "out/frames.csv")}
-    assert [rows[f"f{i:03d}"].status for i in range(6)] == ["fused", "skipped", "fused", "skipped", "fused", "fused"]
+    assert [rows[f"f{i:03d}"].status for i in range(6)] == [
+        "fused",
+        "skipped",
+        "fused",
+        "skipped",
+        "fused",
+        "fused",
+    ]
     assert rows["f001"].reason
     assert rows["f003"].reason
 
@@ -81,7 +94,9 @@ def test_sizes_that_change_midway(tmp_path: Path) -> None:
     write(rgb / "f002.png", np.zeros((24, 32, 3), np.uint8))
     write(fir / "f002.png", np.zeros((24, 32), np.uint8))
     fixed = {"thermal": {"window": (0.0, 1.0)}}
-    assert fuse_to(tmp_path / "aligned", rgb, fir, **fixed).fused == 4  # each pair is its own grid: nothing is lost
+    assert (
+        fuse_to(tmp_path / "aligned", rgb, fir, **fixed).fused == 4
+    )  # each pair is its own grid: nothing is lost
     matrix = tmp_path / "H.txt"
     matrix.write_text("1 0 3\n0 1 2\n0 0 1\n")
     report = fuse_to(tmp_path / "warped", rgb, fir, warp={"homography": str(matrix)}, **fixed)
@@ -110,7 +125,9 @@ def test_a_run_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path) ->
     out = tmp_path / "killed"
     kills = 0
     for _ in range(4):
-        process = subprocess.Popen([*command, str(out)], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [*command, str(out)], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         target = kills * 8 + chance.randint(1, 8)  # frames on disk, not seconds: a slow machine is no failure
         while process.poll() is None and len(list((out / "fused").glob("*.png"))) < target:
             time.sleep(0.001)
@@ -125,12 +142,16 @@ def test_a_run_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path) ->
     assert {stem: (out / f"fused/{stem}.png").stat().st_mtime_ns for stem in finished} == finished
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0 or not shutil.which("mount"), reason="mounting needs root")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0 or not shutil.which("mount"), reason="mounting needs root"
+)
 def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path) -> None:
     rgb, fir = write_pairs(tmp_path, 30, rgb_size_wh=(320, 240), fir_size_wh=(320, 240))
     disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True).returncode:
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True
+    ).returncode:
         pytest.skip("mounting is not allowed here")
     try:
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -17,7 +17,7 @@ from fusion.errors import UsageError
 from fusion.kernels import blend_indexed
 
 BURT = np.array([1, 4, 6, 4, 1]) / 16
-SHAPES = [(1, 1), (1, 50), (50, 1), (7, 5), (16, 16), (17, 16), (31, 33), (64, 95), (121, 90)]
+SHAPES = [(1, 1), (1, 50), (50, 1), (7, 5), (16, 16), (17, 16), (31, 33), (64, 95), (121, 90), (270, 310)]
 
 
 def scene(seed: int, h: int, w: int) -> tuple[NDArray, NDArray, NDArray]:
@@ -128,7 +128,7 @@ def test_laplacian_agrees_with_burts_filter_in_float64(shape: tuple[int, int], a
     expected = np.where(mask[..., None] > 0, laplacian_twin(bgr.astype(np.float64), thermal, alpha), bgr)
     got = blend_laplacian(bgr, index, table, alpha, mask)
     # where two coefficients are equally strong but for float32, either may win
-    assert (abs(got - np.clip(expected, 0, 255)) < 1).mean() > 0.999
+    assert (abs(got - np.clip(expected, 0, 255)) < 0.501).mean() > 0.999
 
 
 def test_laplacian_keeps_the_contrast_that_alpha_halves() -> None:

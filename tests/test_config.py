@@ -29,7 +29,9 @@ def test_thesis_preset_is_the_thesis() -> None:
 
 def test_options_win_over_the_file_and_the_file_over_the_preset(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
-    path.write_text('format = "fusion-blend/1"\npreset = "thesis"\n[blend]\nalpha = 0.7\n[thermal]\nclahe = 2\n')
+    path.write_text(
+        'format = "fusion-blend/1"\npreset = "thesis"\n[blend]\nalpha = 0.7\n[thermal]\nclahe = 2\n'
+    )
     config = load_config(path, {"blend": {"alpha": 0.6}})
     assert (config.preset, config.blend.alpha, config.thermal.clahe) == ("thesis", 0.6, 2)
     assert config.thermal.colormap == "hsv"

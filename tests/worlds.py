@@ -53,4 +53,6 @@ def read(path: Path) -> NDArray[np.uint8]:
 
 def tree(folder: Path) -> dict[str, bytes]:
     """Every file below a folder by its relative name: what two runs are compared by."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }

@@ -15,49 +15,94 @@ RUN = Group("Run", sort_key=5)
 
 
 def blend(
-    rgb: Annotated[str, Parameter(help="Folder, glob pattern, video or image; 4-channel RGB+T files without FIR.")],
+    rgb: Annotated[
+        str, Parameter(help="Folder, glob pattern, video or image; 4-channel RGB+T files without FIR.")
+    ],
     fir: Annotated[str | None, Parameter(help="The same for thermal.")] = None,
     /,
     *,
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], help="Folder for the fused frames.")] = None,
-    dataset: Annotated[str | None, Parameter(help="RGB is the root of this data set (see: fusion datasets list).")] = None,
-    config: Annotated[Path | None, Parameter(help="TOML with any of these settings; options win over it.")] = None,
+    dataset: Annotated[
+        str | None, Parameter(help="RGB is the root of this data set (see: fusion datasets list).")
+    ] = None,
+    config: Annotated[
+        Path | None, Parameter(help="TOML with any of these settings; options win over it.")
+    ] = None,
     preset: Annotated[Literal["auto", "thesis"] | None, Parameter(help="Default: auto.")] = None,
     pair: Annotated[
         Literal["auto", "stem", "index", "stamp", "map", "order"] | None,
         Parameter(group=PAIRING, help="What makes two images a pair."),
     ] = None,
-    rgb_key: Annotated[str | None, Parameter(group=PAIRING, help="Regular expression: the key in an RGB name.")] = None,
+    rgb_key: Annotated[
+        str | None, Parameter(group=PAIRING, help="Regular expression: the key in an RGB name.")
+    ] = None,
     fir_key: Annotated[str | None, Parameter(group=PAIRING, help="The same in a thermal name.")] = None,
     pair_map: Annotated[str | None, Parameter(group=PAIRING, help="CSV (rgb,fir) or JSON of pairs.")] = None,
-    tolerance_ms: Annotated[float | None, Parameter(group=PAIRING, help="Largest time difference of a pair.")] = None,
-    window: Annotated[tuple[float, float] | None, Parameter(group=THERMAL, help="LO HI, stretched to all colours.")] = None,
+    tolerance_ms: Annotated[
+        float | None, Parameter(group=PAIRING, help="Largest time difference of a pair.")
+    ] = None,
+    window: Annotated[
+        tuple[float, float] | None, Parameter(group=THERMAL, help="LO HI, stretched to all colours.")
+    ] = None,
     window_unit: Annotated[
         Literal["fraction", "counts", "celsius", "percentile"] | None,
-        Parameter(group=THERMAL, help="Unit of --window. Default with --window: fraction of the type's range."),
+        Parameter(
+            group=THERMAL, help="Unit of --window. Default with --window: fraction of the type's range."
+        ),
     ] = None,
     window_over: Annotated[
         Literal["frame", "sequence", "running"] | None,
         Parameter(group=THERMAL, help="What percentiles are taken over. Default: sequence."),
     ] = None,
-    celsius_per_count: Annotated[float | None, Parameter(group=THERMAL, help="Scale of the counts, e.g. 0.04.")] = None,
-    celsius_at_zero: Annotated[float | None, Parameter(group=THERMAL, help="Temperature of count 0, e.g. -273.15.")] = None,
-    clahe: Annotated[float | None, Parameter(group=THERMAL, help="Local contrast: clip limit, e.g. 2. Default: off.")] = None,
-    colormap: Annotated[str | None, Parameter(group=THERMAL, help="hsv, hsv-cold-hot, grey, or any of OpenCV's and matplotlib's.")] = None,
-    fir_colour: Annotated[Literal["refuse", "luma"] | None, Parameter(group=THERMAL, help="What to do with thermal in colour.")] = None,
-    homography: Annotated[str | None, Parameter(group=WARP, help="File with the 3x3 matrix from thermal to RGB pixels.")] = None,
-    points: Annotated[str | None, Parameter(group=WARP, help="CSV of matching points: fir_x,fir_y,rgb_x,rgb_y.")] = None,
-    outside: Annotated[Literal["crop", "keep", "fill"] | None, Parameter(group=WARP, help="Where thermal does not reach.")] = None,
-    fill_bgr: Annotated[tuple[int, int, int] | None, Parameter(group=WARP, help="Colour for --outside fill.")] = None,
+    celsius_per_count: Annotated[
+        float | None, Parameter(group=THERMAL, help="Scale of the counts, e.g. 0.04.")
+    ] = None,
+    celsius_at_zero: Annotated[
+        float | None, Parameter(group=THERMAL, help="Temperature of count 0, e.g. -273.15.")
+    ] = None,
+    clahe: Annotated[
+        float | None, Parameter(group=THERMAL, help="Local contrast: clip limit, e.g. 2. Default: off.")
+    ] = None,
+    colormap: Annotated[
+        str | None,
+        Parameter(group=THERMAL, help="hsv, hsv-cold-hot, grey, or any of OpenCV's and matplotlib's."),
+    ] = None,
+    fir_colour: Annotated[
+        Literal["refuse", "luma"] | None, Parameter(group=THERMAL, help="What to do with thermal in colour.")
+    ] = None,
+    homography: Annotated[
+        str | None, Parameter(group=WARP, help="File with the 3x3 matrix from thermal to RGB pixels.")
+    ] = None,
+    points: Annotated[
+        str | None, Parameter(group=WARP, help="CSV of matching points: fir_x,fir_y,rgb_x,rgb_y.")
+    ] = None,
+    outside: Annotated[
+        Literal["crop", "keep", "fill"] | None, Parameter(group=WARP, help="Where thermal does not reach.")
+    ] = None,
+    fill_bgr: Annotated[
+        tuple[int, int, int] | None, Parameter(group=WARP, help="Colour for --outside fill.")
+    ] = None,
     method: Annotated[str | None, Parameter(group=BLEND, help="alpha or laplacian.")] = None,
     alpha: Annotated[float | None, Parameter(group=BLEND, help="Weight of RGB. Default: 0.85.")] = None,
-    format: Annotated[Literal["png", "jpg"] | None, Parameter(group=BLEND, help="png is lossless. Default: png.")] = None,  # noqa: A002
+    format: Annotated[
+        Literal["png", "jpg"] | None, Parameter(group=BLEND, help="png is lossless. Default: png.")
+    ] = None,  # noqa: A002
     quality: Annotated[int | None, Parameter(group=BLEND, help="JPEG quality 1 to 100. Default: 90.")] = None,
-    workers: Annotated[int | None, Parameter(group=RUN, help="Threads. Default: one a core; the output is the same.")] = None,
-    strict: Annotated[bool | None, Parameter(group=RUN, help="Stop at the first unmatched or unusable frame.")] = None,
-    overwrite: Annotated[bool, Parameter(group=RUN, help="Replace the frames of another run in OUT.")] = False,
-    dry_run: Annotated[bool, Parameter(group=RUN, help="Only report the pairing (with --preview: and draw it).")] = False,
-    preview: Annotated[bool, Parameter(group=RUN, help="Write OUT/preview.png, a contact sheet of every step.")] = False,
+    workers: Annotated[
+        int | None, Parameter(group=RUN, help="Threads. Default: one a core; the output is the same.")
+    ] = None,
+    strict: Annotated[
+        bool | None, Parameter(group=RUN, help="Stop at the first unmatched or unusable frame.")
+    ] = None,
+    overwrite: Annotated[
+        bool, Parameter(group=RUN, help="Replace the frames of another run in OUT.")
+    ] = False,
+    dry_run: Annotated[
+        bool, Parameter(group=RUN, help="Only report the pairing (with --preview: and draw it).")
+    ] = False,
+    preview: Annotated[
+        bool, Parameter(group=RUN, help="Write OUT/preview.png, a contact sheet of every step.")
+    ] = False,
     quiet: Annotated[bool, Parameter(group=RUN, help="No progress, no table.")] = False,
 ) -> None:
     """Fuse RGB and thermal images into a folder of frames."""

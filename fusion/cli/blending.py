@@ -120,7 +120,9 @@ def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | Non
         fir = inputs[1] if len(inputs) == 2 else None
         return open_pairs(inputs[0], fir, settings.pairing.rule(), fir_colour=settings.thermal.fir_colour)
     if len(inputs) != 1:
-        raise UsageError("a data set has one root", where="--dataset", hint="fusion blend --dataset NAME ROOT -o OUT")
+        raise UsageError(
+            "a data set has one root", where="--dataset", hint="fusion blend --dataset NAME ROOT -o OUT"
+        )
     manifest = load_manifest(dataset)
     if not manifest.registered and not (settings.warp.homography or settings.warp.points):
         raise InputError(
@@ -184,7 +186,12 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]:.0f} frames/s"), TimeRemainingColumn())
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]:.0f} frames/s"),
+        TimeRemainingColumn(),
+    )
     with Progress("fusing", *columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("fusing", total=None, rate=0.0)
         began = time.monotonic()

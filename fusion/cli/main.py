@@ -36,10 +36,18 @@ app = App(
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
 datasets = App(name="datasets", help="List and show the data sets whose layout is known.")
 datasets.command("fusion.cli.datasets:list_datasets", name="list", help="List the known data sets.")
-datasets.command("fusion.cli.datasets:show_dataset", name="show", help="Show one data set: layout, licence, where to get it.")
+datasets.command(
+    "fusion.cli.datasets:show_dataset",
+    name="show",
+    help="Show one data set: layout, licence, where to get it.",
+)
 app.command(datasets)
 simulate = App(name="simulate", help="Make sample data with the truth beside it.")
-simulate.command("fusion.cli.simulate:simulate_pairs", name="pairs", help="Draw unregistered RGB-thermal pairs of a mine, with their truth.")
+simulate.command(
+    "fusion.cli.simulate:simulate_pairs",
+    name="pairs",
+    help="Draw unregistered RGB-thermal pairs of a mine, with their truth.",
+)
 app.command(simulate)
 
 USAGE, INTERRUPTED, INTERNAL = 2, 130, 70
@@ -62,7 +70,9 @@ def _guarded() -> int:
     except MemoryError:
         return _complain("out of memory (try fewer --workers)", 1)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read us has left: say no more
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # whoever read us has left: say no more
         return 0
     except OSError as error:
         return _complain(f"{error.filename or 'system'}: {error.strerror or error}", 1)
@@ -70,7 +80,9 @@ def _guarded() -> int:
         if os.environ.get("FUSION_DEBUG"):
             raise
         what = f"{type(error).__name__}: {error}".splitlines()[0]
-        return _complain(f"a fault of fusion's own: {what} (please report it; FUSION_DEBUG=1 shows more)", INTERNAL)
+        return _complain(
+            f"a fault of fusion's own: {what} (please report it; FUSION_DEBUG=1 shows more)", INTERNAL
+        )
     return 0
 
 

@@ -25,8 +25,20 @@ def plan_lines(fuser: Fuser) -> list[str]:
     ]
     if not warp.full:
         rows.append(("border", f"left {left}, top {top}, right {right}, bottom {bottom} px"))
-        rows.append(("outside", f"crop to {width}x{height} at ({x}, {y})" if config.warp.outside == "crop" else config.warp.outside))
-    rows.append(("preset", f"{config.preset}: colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}"))
+        rows.append(
+            (
+                "outside",
+                f"crop to {width}x{height} at ({x}, {y})"
+                if config.warp.outside == "crop"
+                else config.warp.outside,
+            )
+        )
+    rows.append(
+        (
+            "preset",
+            f"{config.preset}: colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}",
+        )
+    )
     return [*_table(rows), *(f"note: {note}" for note in pairing.notes)]
 
 
@@ -55,9 +67,13 @@ def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
     if len(report.skipped) > LOUD_SKIPS:
         warnings.append(f"… and {len(report.skipped) - LOUD_SKIPS} more, all named in frames.csv")
     if fuser.pairs.pairing.unmatched:
-        warnings.append(f"{len(fuser.pairs.pairing.unmatched)} images without a partner are named in unmatched.csv")
+        warnings.append(
+            f"{len(fuser.pairs.pairing.unmatched)} images without a partner are named in unmatched.csv"
+        )
     if fuser.size_groups > 1:
-        warnings.append(f"the images come in {fuser.size_groups} different sizes; frames differ in size accordingly")
+        warnings.append(
+            f"the images come in {fuser.size_groups} different sizes; frames differ in size accordingly"
+        )
     warnings += [f"window sample passed over: {reason}" for reason in fuser.windows.skipped]
     advice = clip_advice(report.clipped_below, report.clipped_above, fuser.config.thermal.rule())
     return [*warnings, *([advice] if advice else [])]
@@ -68,7 +84,9 @@ def _registration(fuser: Fuser) -> str:
     if fit is None:
         return "none: scaled to fit" if registration.kind == "scale" else registration.kind
     text = f"{fit.inliers} of {fit.count} points, rms {fit.rms_px:.2f} px, largest {fit.max_px:.2f} px"
-    return text + (f", left out median {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else "")
+    return text + (
+        f", left out median {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else ""
+    )
 
 
 def _span(span: tuple[float, float] | None) -> str:

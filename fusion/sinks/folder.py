@@ -171,7 +171,9 @@ class FolderSink:
         hint = "choose another -o, or pass --overwrite to replace that run's frames"
         if not path.exists():
             if rows or any((self.out / "fused").glob("*")):
-                raise OutputError("holds frames, but no run.toml that says whose they are", where=self.out, hint=hint)
+                raise OutputError(
+                    "holds frames, but no run.toml that says whose they are", where=self.out, hint=hint
+                )
             return
         try:
             before = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
@@ -183,7 +185,10 @@ class FolderSink:
 
     def _delete(self, rows: list[Row]) -> None:
         for row in rows:
-            for path in (*(self._frame_path(row.stem, s) for s in (".png", ".jpg")), self._mask_path(row.stem)):
+            for path in (
+                *(self._frame_path(row.stem, s) for s in (".png", ".jpg")),
+                self._mask_path(row.stem),
+            ):
                 path.unlink(missing_ok=True)
         for name in ("frames.csv", "run.toml", "unmatched.csv", "preview.png"):
             (self.out / name).unlink(missing_ok=True)

@@ -73,7 +73,8 @@ class VideoSource:
     their time with another. `read` may be called from several threads: requests that come nearly in
     order share one forward pass. A frame that is damaged, that builds on a damaged one, or that the
     container announces but does not hold, raises `FrameError`, whatever the order of reading. Damage that
-    the decoder itself does not report (ffv1 and vp9 mend it in silence) cannot be seen here.
+    the decoder does not report (ffv1 and vp9 mend it in silence) cannot be seen here, and what it leaves
+    in a picture may then hang on that order.
     """
 
     def __init__(self, spec: str, role: Role, *, fir_colour: FirColour, max_pixels: int) -> None:

@@ -36,7 +36,12 @@ def test_blend_writes_what_the_readme_says(fusion: Fusion, tmp_path: Path) -> No
     answer = fusion("blend", rgb, fir, "-o", tmp_path / "out", "--preview", "--workers", 2)
     assert answer.code == 0, answer.err
     names = tree(tmp_path / "out")
-    assert sorted(names) == ["frames.csv", *(f"fused/f{i:03d}.png" for i in range(5)), "preview.png", "run.toml"]
+    assert sorted(names) == [
+        "frames.csv",
+        *(f"fused/f{i:03d}.png" for i in range(5)),
+        "preview.png",
+        "run.toml",
+    ]
     assert "NOT REGISTERED" in answer.err  # 50x40 onto 64x48 is scaled to fit, said loudly
     run = tomllib.loads(names["run.toml"].decode())
     assert run["config"]["preset"] == "auto"
@@ -53,7 +58,9 @@ def test_thesis_preset_equals_the_thesis_in_float64(fusion: Fusion, tmp_path: Pa
         bgr, grey = read(rgb / name).astype(np.float64), read(fir / name).astype(np.float64) / 255
         s = np.clip((grey - 0.3) / 0.3, 0, 1)
         hue = np.floor(255 * s + 0.5) / 256
-        sector = np.abs((6 * hue[..., None] - np.array([4, 2, 0]) + 3) % 6 - 3)  # distance to blue, green, red
+        sector = np.abs(
+            (6 * hue[..., None] - np.array([4, 2, 0]) + 3) % 6 - 3
+        )  # distance to blue, green, red
         colour = np.floor(255 * np.clip(2 - sector, 0, 1) + 0.5)
         exact = 0.85 * bgr + 0.15 * colour
         fused = read(tmp_path / "out/fused" / name)
@@ -66,7 +73,21 @@ def test_points_and_policies(fusion: Fusion, tmp_path: Path) -> None:
     points.write_text("fir_x,fir_y,rgb_x,rgb_y\n0,0,12,9\n39,0,51,9\n39,29,51,38\n0,29,12,38\n")
     results = {}
     for outside in ("crop", "keep", "fill"):
-        answer = fusion("blend", rgb, fir, "-o", tmp_path / outside, "--points", points, "--outside", outside, "--fill-bgr", 9, 8, 7)
+        answer = fusion(
+            "blend",
+            rgb,
+            fir,
+            "-o",
+            tmp_path / outside,
+            "--points",
+            points,
+            "--outside",
+            outside,
+            "--fill-bgr",
+            9,
+            8,
+            7,
+        )
         assert answer.code == 0, answer.err
         assert "left 12, top 9, right 12, bottom 9 px" in answer.out
         results[outside] = read(tmp_path / outside / "fused/f000.png")
@@ -170,7 +191,9 @@ def test_an_image_that_claims_to_be_huge_takes_no_memory(fusion: Fusion, tmp_pat
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0))
-    (rgb / "f000.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b""))
+    (rgb / "f000.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(100))) + chunk(b"IEND", b"")
+    )
     answer = fusion("blend", rgb, fir, "-o", tmp_path / "out")
     assert answer.code == 0
     assert "100000x100000" in answer.err.replace(" ", "")
@@ -204,7 +227,9 @@ def test_output_inside_the_input(fusion: Fusion, tmp_path: Path) -> None:
 def test_absurd_homographies(fusion: Fusion, tmp_path: Path, matrix: str, word: str) -> None:
     rgb, fir = write_pairs(tmp_path, 2)
     (tmp_path / "H.txt").write_text(matrix)
-    one_line(fusion("blend", rgb, fir, "-o", tmp_path / "out", "--homography", tmp_path / "H.txt"), word, code=2)
+    one_line(
+        fusion("blend", rgb, fir, "-o", tmp_path / "out", "--homography", tmp_path / "H.txt"), word, code=2
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -235,7 +260,9 @@ def test_options_that_cannot_be(fusion: Fusion, tmp_path: Path, options: list[st
     assert not (tmp_path / "out").exists()
 
 
-def test_names_with_spaces_other_alphabets_and_only_a_difference_in_case(fusion: Fusion, tmp_path: Path) -> None:
+def test_names_with_spaces_other_alphabets_and_only_a_difference_in_case(
+    fusion: Fusion, tmp_path: Path
+) -> None:
     rgb, fir = write_pairs(tmp_path, 4)
     for old, new in zip(("f000", "f001", "f002", "f003"), ("два слова", "鉱山 1", "A b", "a b"), strict=True):
         for folder in (rgb, fir):
@@ -272,9 +299,13 @@ def test_an_unregistered_data_set_needs_a_registration(fusion: Fusion, tmp_path:
     root = tmp_path / "set" / "ir_det_dataset" / "Images"
     write_pairs(root, 2)
     top, out = tmp_path / "set" / "ir_det_dataset", tmp_path / "out"
-    one_line(fusion("blend", "--dataset", "mil_multispectral", top, "-o", out), "mil_multispectral", "--homography")
+    one_line(
+        fusion("blend", "--dataset", "mil_multispectral", top, "-o", out), "mil_multispectral", "--homography"
+    )
     (tmp_path / "H.txt").write_text("1 0 1\n0 1 1\n0 0 1\n")
-    answer = fusion("blend", "--dataset", "mil_multispectral", top, "-o", out, "--homography", tmp_path / "H.txt")
+    answer = fusion(
+        "blend", "--dataset", "mil_multispectral", top, "-o", out, "--homography", tmp_path / "H.txt"
+    )
     assert answer.code == 0, answer.err
 
 
@@ -285,7 +316,9 @@ def test_help_is_there_and_loads_nothing_heavy() -> None:
         "print(sorted({'numpy', 'cv2', 'numba', 'pydantic', 'matplotlib', 'scipy', 'open3d', 'av'} & set(sys.modules)))"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True).stdout
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    ).stdout
     assert "blend" in said
     assert said.strip().endswith("[]")
 
@@ -302,7 +335,9 @@ def test_blend_help_shows_worked_examples(fusion: Fusion) -> None:
 
 @pytest.mark.parametrize("name", ["MSRS", "RoadScene", "TNO"])
 @pytest.mark.parametrize("preset", ["auto", "thesis"])
-def test_real_aligned_pairs(fusion: Fusion, tmp_path: Path, shared_data: Path, name: str, preset: str) -> None:
+def test_real_aligned_pairs(
+    fusion: Fusion, tmp_path: Path, shared_data: Path, name: str, preset: str
+) -> None:
     folder = shared_data / "rgbt_pairs" / name
     answer = fusion("blend", folder / "vi", folder / "ir", "-o", tmp_path / "out", "--preset", preset)
     assert answer.code == 0, answer.err
@@ -318,7 +353,9 @@ def test_real_radiometric_counts(fusion: Fusion, tmp_path: Path, shared_data: Pa
     tiff = shared_data / "radiometric" / "example_radiometric.tiff"
     rgb = write(tmp_path / "scene.png", np.full((512, 640, 3), 90, np.uint8))
     scale = ["--celsius-per-count", 0.04, "--celsius-at-zero", -273.15]
-    answer = fusion("blend", rgb, tiff, "-o", tmp_path / "c", "--window", 0, 8, "--window-unit", "celsius", *scale)
+    answer = fusion(
+        "blend", rgb, tiff, "-o", tmp_path / "c", "--window", 0, 8, "--window-unit", "celsius", *scale
+    )
     assert answer.code == 0, answer.err
     row = (tmp_path / "c/frames.csv").read_text().splitlines()[1].split(",")
     assert (float(row[6]), float(row[7])) == pytest.approx((273.15 / 0.04, 281.15 / 0.04), rel=1e-9)

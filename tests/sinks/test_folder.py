@@ -17,7 +17,9 @@ def frame(stem: str, value: int = 7, mask: bool = False) -> FusedFrame:
     bgr[2, 3] = (1, 2, 3)
     seen = np.full((6, 9), 255, np.uint8)
     seen[:, 0] = 0
-    return FusedFrame(stem, bgr, seen if mask else None, Window(1.5, 9), 0.25, 0.125, 0.9, 10, 14, ("rgb-grey",))
+    return FusedFrame(
+        stem, bgr, seen if mask else None, Window(1.5, 9), 0.25, 0.125, 0.9, 10, 14, ("rgb-grey",)
+    )
 
 
 def write_all(out: Path, *frames: FusedFrame, **options: object) -> None:
@@ -28,17 +30,33 @@ def write_all(out: Path, *frames: FusedFrame, **options: object) -> None:
 
 def test_layout_and_index(tmp_path: Path) -> None:
     write_all(tmp_path / "out", frame("a b"), frame("sub/ä", mask=True))
-    assert sorted(tree(tmp_path / "out")) == ["frames.csv", "fused/a b.png", "fused/sub/ä.png", "mask/sub/ä.png", "run.toml"]
+    assert sorted(tree(tmp_path / "out")) == [
+        "frames.csv",
+        "fused/a b.png",
+        "fused/sub/ä.png",
+        "mask/sub/ä.png",
+        "run.toml",
+    ]
     assert np.array_equal(read(tmp_path / "out/fused/sub/ä.png"), frame("x").bgr)
     assert np.array_equal(read(tmp_path / "out/mask/sub/ä.png")[:, :2], np.tile([[0, 255]], (6, 1)))
     row = read_rows(tmp_path / "out/frames.csv")[0]
-    assert (row.stem, row.fir_stem, row.status, row.dt_ns, row.window_lo, row.coverage) == ("a b", "t_a b", "fused", "4", "1.5", "0.900000")
+    assert (row.stem, row.fir_stem, row.status, row.dt_ns, row.window_lo, row.coverage) == (
+        "a b",
+        "t_a b",
+        "fused",
+        "4",
+        "1.5",
+        "0.900000",
+    )
     assert (row.clipped_below, row.clipped_above, row.flags) == ("0.250000", "0.125000", "rgb-grey")
     assert int(row.size) == (tmp_path / "out/fused/a b.png").stat().st_size
 
 
 def test_names_with_commas_quotes_and_newlines_survive_the_index(tmp_path: Path) -> None:
-    rows = [Row('a,"b"', "c\nd", "fused"), Row.skipped("x", "y", FrameError("half a file", where="/secret/path"))]
+    rows = [
+        Row('a,"b"', "c\nd", "fused"),
+        Row.skipped("x", "y", FrameError("half a file", where="/secret/path")),
+    ]
     (tmp_path / "i.csv").write_text(to_csv(rows), encoding="utf-8")
     assert read_rows(tmp_path / "i.csv") == rows
     assert "/secret" not in to_csv(rows)
@@ -48,7 +66,9 @@ def test_names_with_commas_quotes_and_newlines_survive_the_index(tmp_path: Path)
 def test_a_half_written_last_row_does_not_count(tmp_path: Path, cut: int) -> None:
     text = to_csv([Row("a", "b", "fused", size="1"), Row("c", "d", "fused", size="2")], header=False)
     (tmp_path / "j.csv").write_text(text[:-cut])
-    assert [row.stem for row in read_rows(tmp_path / "j.csv", header=False)] in ([["a"]] if cut < 20 else [["a"], []])
+    assert [row.stem for row in read_rows(tmp_path / "j.csv", header=False)] in (
+        [["a"]] if cut < 20 else [["a"], []]
+    )
 
 
 def test_leaving_on_an_error_keeps_the_journal_and_the_next_run_goes_on(tmp_path: Path) -> None:
@@ -83,7 +103,10 @@ def test_another_runs_folder_is_refused_untouched_with_the_difference_named(tmp_
     out = tmp_path / "out"
     write_all(out, frame("a"))
     before = tree(out)
-    with pytest.raises(OutputError, match=r"config\.alpha was 0\.85, is 0\.5.*--overwrite"), FolderSink(out, {"config": {"alpha": 0.5}}):
+    with (
+        pytest.raises(OutputError, match=r"config\.alpha was 0\.85, is 0\.5.*--overwrite"),
+        FolderSink(out, {"config": {"alpha": 0.5}}),
+    ):
         pass
     assert tree(out) == before
 
