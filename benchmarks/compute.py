@@ -21,13 +21,14 @@ PART, WHOLE = 0.9, 1.15  # size of the thermal image on the RGB grid: it covers 
 AGREE = 1.0  # grey levels of mean difference that the other implementations may show
 
 TEXT = """\
-Windowing (`index_counts`), warping by a homography (`Warp.apply`: turned by 1.5 degrees, slightly tilted) and blending into RGB, in
-memory, on one thread (`cv2.setNumThreads(1)`), output allocated anew for each frame as the pipeline does.
-*Part* means that thermal covers {part:.0%} of the RGB grid and the rest is kept by the mask (the default policy), *all* that it
-covers everything. *Copy* is `numpy.copyto` of the RGB frame's bytes and of the thermal frame's bytes into arrays that exist already.
-*Floats* is `cv2.warpPerspective` of the counts, then window, colour table and blend in numpy float64, rounded. *OpenCV* is `LUT` (16-bit:
-`subtract` and `convertScaleAbs`), `warpPerspective`, `applyColorMap`, `addWeighted` and a masked copy, no line of ours. Each was checked to give our
-pixels to within {agree:g} grey level on average."""
+Windowing (`index_counts`), warping by a homography (`Warp.apply`: turned by 1.5 degrees, slightly tilted)
+and blending into RGB, in memory, on one thread (`cv2.setNumThreads(1)`), output allocated anew for each
+frame as the pipeline does. *Part* means that thermal covers {part:.0%} of the RGB grid and the rest is kept
+by the mask (the default policy), *all* that it covers everything. *Copy* is `numpy.copyto` of the RGB
+frame's bytes and of the thermal frame's bytes into arrays that exist already. *Floats* is
+`cv2.warpPerspective` of the counts, then window, colour table and blend in numpy float64, rounded. *OpenCV*
+is `LUT` (16-bit: `subtract` and `convertScaleAbs`), `warpPerspective`, `applyColorMap`, `addWeighted` and a
+masked copy, no line of ours. Each was checked to give our pixels to within {agree:g} grey level on average."""
 
 
 def registration(size_wh: tuple[int, int], scale: float) -> NDArray[np.float64]:
@@ -93,7 +94,9 @@ class Jobs:
         for way in (self.floats, self.opencv):
             apart = float(np.abs(way() - ours).mean())
             if apart > AGREE:
-                raise AssertionError(f"{self.case.name}: {way.__name__} differs by {apart:.2f} grey levels on average")
+                raise AssertionError(
+                    f"{self.case.name}: {way.__name__} differs by {apart:.2f} grey levels on average"
+                )
 
 
 WINDOW_8 = Case((1, 1), 8).window
@@ -128,7 +131,21 @@ def _rows(jobs: Jobs, name: str, rounds: int) -> list[Row]:
     taken = interleaved({way: repeated(call, times[way]) for way, call in ways.items()}, rounds)
     ours = milliseconds(taken["ours"])
     return [
-        Row(f"{name}: ours / copy", ours, milliseconds(taken["copy"]), taken["ours"].over(taken["copy"]), at_most(8)),
-        Row(f"{name}: floats / ours", ours, milliseconds(taken["floats"]), taken["floats"].over(taken["ours"]), at_least(12)),
-        Row(f"{name}: OpenCV / ours", ours, milliseconds(taken["opencv"]), taken["opencv"].over(taken["ours"])),
+        Row(
+            f"{name}: ours / copy",
+            ours,
+            milliseconds(taken["copy"]),
+            taken["ours"].over(taken["copy"]),
+            at_most(8),
+        ),
+        Row(
+            f"{name}: floats / ours",
+            ours,
+            milliseconds(taken["floats"]),
+            taken["floats"].over(taken["ours"]),
+            at_least(12),
+        ),
+        Row(
+            f"{name}: OpenCV / ours", ours, milliseconds(taken["opencv"]), taken["opencv"].over(taken["ours"])
+        ),
     ]

@@ -1,7 +1,7 @@
 """Test images with texture and noise, the same on every machine, and folders full of them.
 
-A frame is a smooth random field (three octaves, so that there is structure at every scale) with Gaussian noise as
-a sensor adds it. Without the noise every PNG encoder looks better than it is.
+A frame is a smooth random field (three octaves: structure at every scale) with Gaussian noise as a sensor
+adds it. Without the noise every PNG encoder looks better than it is.
 """
 
 from __future__ import annotations
@@ -68,14 +68,16 @@ def fir_frame(rng: np.random.Generator, case: Case) -> NDArray[np.uint8] | NDArr
     return np.rint(np.clip(noisy, 0, 65535)).astype(np.uint16)
 
 
-def pairs_of(case: Case, count: int) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8] | NDArray[np.uint16]]]:
+def pairs_of(
+    case: Case, count: int
+) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8] | NDArray[np.uint16]]]:
     """`count` different pairs (BGR, counts), always the same ones."""
     rng = np.random.default_rng([SEED, *case.size_wh, case.bits])
     return [(rgb_frame(rng, case.size_wh), fir_frame(rng, case)) for _ in range(count)]
 
 
 def write_folder(folder: Path, case: Case, distinct: int, count: int, suffix: str = ".png") -> None:
-    """`count` pairs as folder/rgb/000000.png and folder/fir/000000.png: `distinct` ones, repeated as hard links.
+    """`count` pairs, folder/rgb/000000.png and folder/fir/000000.png: `distinct` ones, repeated as links.
 
     PNG as `cv2.imwrite` writes it by default; JPEG with quality 92 (grey for thermal).
     """

@@ -1,4 +1,4 @@
-"""Folder to folder inside one process: what the run costs beyond its own codecs, and what a second worker brings."""
+"""Folder to folder in one process: what the run costs beyond its codecs, what a second worker brings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from fusion.batch import opencv_on_one_thread
 from fusion.codecs import decode_image, encode_jpeg, encode_png
 
 TEXT = """\
-`fusion.run` from a folder of pairs to a folder of frames, registered pairs, fixed window, {frames} frames a round at 640x480 and a
-quarter of that at 1280x1024. *Codecs alone* reads the same files (`Path.read_bytes`), decodes them (`decode_image`), encodes the
-fused pixels, which it holds already (`encode_png`, `encode_jpeg`), and writes them (`Path.write_bytes`): no pairing, no kernel, no index, no rename."""
+`fusion.run` from a folder of pairs to a folder of frames, registered pairs, fixed window, {frames} frames a
+round at 640x480 and a quarter of that at 1280x1024. *Codecs alone* reads the same files
+(`Path.read_bytes`), decodes them (`decode_image`), encodes the fused pixels, which it holds already
+(`encode_png`, `encode_jpeg`), and writes them (`Path.write_bytes`): no pairing, no kernel, no index, no
+rename."""
 
 
 def measure(space: Workspace, distinct: int, frames: int, rounds: int) -> Section:
@@ -62,7 +64,9 @@ class Folders:
             path = self.pairs / role / name
             decode_image(path.read_bytes(), name)
         bgr = self.fused[index % len(self.fused)]
-        data = encode_png(bgr) if self.suffix == ".png" else encode_jpeg(bgr, self.fuser.config.output.quality)
+        data = (
+            encode_png(bgr) if self.suffix == ".png" else encode_jpeg(bgr, self.fuser.config.output.quality)
+        )
         (out / name).write_bytes(data)
 
 
@@ -86,6 +90,12 @@ def _rows(folders: Folders, rounds: int) -> list[Row]:
     wanted = (at_most(1.1), at_least(1.65)) if kind == "PNG" else (None, None)
     name = f"{kind}, {folders.case.name}"
     return [
-        Row(f"{name}: one worker / codecs alone", milliseconds(one), milliseconds(alone), one.over(alone), wanted[0]),
+        Row(
+            f"{name}: one worker / codecs alone",
+            milliseconds(one),
+            milliseconds(alone),
+            one.over(alone),
+            wanted[0],
+        ),
         Row(f"{name}: one worker / two", milliseconds(two), milliseconds(one), one.over(two), wanted[1]),
     ]

@@ -41,7 +41,14 @@ class Ffmpeg:
         return [
             *(FFMPEG or "ffmpeg", "-nostdin", "-v", "error", "-y"),
             *("-filter_complex_threads", str(self.filter_threads)),
-            *(*source, "-i", str(pairs / f"rgb/%06d{suffix}"), *source, "-i", str(pairs / f"fir/%06d{suffix}")),
+            *(
+                *source,
+                "-i",
+                str(pairs / f"rgb/%06d{suffix}"),
+                *source,
+                "-i",
+                str(pairs / f"fir/%06d{suffix}"),
+            ),
             *("-filter_complex", GRAPHS[self.graph].format(**expressions(case))),
             *("-frames:v", str(count), "-fps_mode", "passthrough", "-start_number", "0"),
             *(*self.output, "-threads", str(self.encode_threads), str(out / f"%06d{suffix}")),
@@ -53,12 +60,13 @@ class Ffmpeg:
         return f"{self.graph}; {' '.join(self.output)}; {threads} (decode/filter/encode)"
 
 
-# The window and the colour map are one table each for red, green and blue. {index} windows 16-bit counts to 8 bit.
+# Window and colour map are one table each for red, green and blue. {index} windows 16-bit counts to 8 bit.
 GRAPHS = {
     # alpha blend as such
     "lutrgb + blend=normal": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];"
     "[r][t]blend=all_mode=normal:all_opacity=0.85",
-    "lutrgb + mix": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];[r][t]mix=weights='0.85 0.15'",
+    "lutrgb + mix": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];"
+    "[r][t]mix=weights='0.85 0.15'",
     "lutrgb with alpha + overlay": "[0:v]format=gbrp[r];[1:v]{index}format=gbrap,lutrgb={colour}:a=38[t];"
     "[r][t]overlay=format=gbrp",
     # the weights in the tables, the sum in SIMD
@@ -104,19 +112,30 @@ def _index_16(case: Case) -> str:
     return f"format=gray16,lut=y='256*round(255*clip((val-{lo})/{hi - lo},0,1))',format=gray,"
 
 
-def tune(pairs: Path, out: Path, case: Case, count: int, suffix: str, outputs: Sequence[tuple[str, ...]]) -> list[tuple[Ffmpeg, float]]:
+def tune(
+    pairs: Path, out: Path, case: Case, count: int, suffix: str, outputs: Sequence[tuple[str, ...]]
+) -> list[tuple[Ffmpeg, float]]:
     """Try graphs, then encoder options, then threads, each with the best so far; the fastest first."""
     tried: dict[Ffmpeg, float] = {}
 
     def fastest(candidates: Sequence[Ffmpeg]) -> Ffmpeg:
         for candidate in candidates:
             if candidate not in tried:
-                tried[candidate] = min(run_ffmpeg(candidate, pairs, out, case, count, suffix) for _ in range(2))
+                tried[candidate] = min(
+                    run_ffmpeg(candidate, pairs, out, case, count, suffix) for _ in range(2)
+                )
         return min(candidates, key=lambda candidate: tried[candidate])
 
     best = fastest([Ffmpeg(graph, outputs[0]) for graph in GRAPHS])
     best = fastest([best, *(replace(best, output=output) for output in outputs[1:])])
-    best = fastest([best, replace(best, decode_threads=1), replace(best, encode_threads=3), replace(best, filter_threads=1)])
+    best = fastest(
+        [
+            best,
+            replace(best, decode_threads=1),
+            replace(best, encode_threads=3),
+            replace(best, filter_threads=1),
+        ]
+    )
     return sorted(tried.items(), key=lambda item: item[1])
 
 
@@ -140,7 +159,7 @@ BLENDS = {
 
 @dataclass(frozen=True, slots=True)
 class Magick:
-    """One way of using ImageMagick: one process for each frame, or two processes with half of the frames each."""
+    """One way of using ImageMagick: a process for each frame, or two processes with half of the frames each."""
 
     process_per_frame: bool
     blend: str
@@ -148,12 +167,18 @@ class Magick:
 
     @property
     def words(self) -> str:
-        processes = "a process a frame, two at a time" if self.process_per_frame else "two processes, half of the frames each"
+        processes = (
+            "a process a frame, two at a time"
+            if self.process_per_frame
+            else "two processes, half of the frames each"
+        )
         return f"{processes}; -clut; {BLENDS[self.blend]}; {self.write or 'default PNG settings'}"
 
     def commands(self, pairs: Path, out: Path, case: Case, count: int) -> list[list[str]]:
         step = 1 if self.process_per_frame else (count + 1) // 2
-        return [self._command(pairs, out, case, range(at, min(at + step, count))) for at in range(0, count, step)]
+        return [
+            self._command(pairs, out, case, range(at, min(at + step, count))) for at in range(0, count, step)
+        ]
 
     def _command(self, pairs: Path, out: Path, case: Case, frames: range) -> list[str]:
         lo, hi = (limit * (257 if case.bits == 8 else 1) for limit in case.window)
@@ -164,7 +189,14 @@ class Magick:
         for frame in frames:
             rgb, fir = (str(pairs / f"{name}/{frame:06d}.png") for name in ("rgb", "fir"))
             command += [rgb, *rgb_dim, "(", fir, *clut, *fir_dim, ")", *BLENDS[self.blend].split()]
-            command += ["-depth", "8", *self.write.split(), "-write", str(out / f"{frame:06d}.png"), "+delete"]
+            command += [
+                "-depth",
+                "8",
+                *self.write.split(),
+                "-write",
+                str(out / f"{frame:06d}.png"),
+                "+delete",
+            ]
         return [*command[:-1], "null:"]  # the last image stays: an empty list at the end is an error
 
 
@@ -194,7 +226,7 @@ def _into(out: Path, count: int, suffix: str, commands: list[list[str]]) -> floa
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     with ThreadPoolExecutor(2) as pool:
-        seconds = clocked(lambda: [done for done in pool.map(_run, commands)])
+        seconds = clocked(lambda: list(pool.map(_run, commands)))
     made = len(list(out.glob(f"*{suffix}")))
     if made != count:
         raise RuntimeError(f"{commands[0][0]} made {made} of {count} files")

@@ -83,8 +83,16 @@ def summary(sections: Iterable[Section]) -> str:
     """How many targets are met, and every missed one by its name."""
     rows = [(section, row) for section in sections for row in section.rows if row.target is not None]
     judged = [(section, row) for section, row in rows if row.ratio is not None]
-    missed = [f"- missed: {section.title}: {row.what}: {row.cells()[3]}, wanted {row.target}" for section, row in judged if row.missed]
-    silent = [f"- not measured: {section.title}: {row.what}: {row.note}" for section, row in rows if row.ratio is None]
+    missed = [
+        f"- missed: {section.title}: {row.what}: {row.cells()[3]}, wanted {row.target}"
+        for section, row in judged
+        if row.missed
+    ]
+    silent = [
+        f"- not measured: {section.title}: {row.what}: {row.note}"
+        for section, row in rows
+        if row.ratio is None
+    ]
     head = f"{len(judged) - len(missed)} of {len(rows)} targets met."
     return "\n".join([head, *([""] if missed or silent else []), *missed, *silent])
 

@@ -52,14 +52,16 @@ def workspace() -> Iterator[Workspace]:
 def storage() -> str:
     if os.access(MEMORY_BACKED, os.W_OK):
         return "files in memory-backed storage (tmpfs)"
-    return "files in the system's temporary folder, **no memory-backed storage was there: the disk is part of the figures**"
+    return "files in the system's temporary folder (**no memory-backed storage: the disk is part of the figures**)"
 
 
-def blend_command(case: Case, pairs: Path, out: Path, *, workers: int, suffix: str = ".png", count: int | None = None) -> list[str]:
-    """`fusion blend` with the window fixed, of all pairs or (through a glob pattern) of number 0 alone."""
-    only = "" if count is None else "/00000[0]" + suffix
+def blend_command(
+    case: Case, pairs: Path, out: Path, *, workers: int, suffix: str = ".png", one_pair: bool = False
+) -> list[str]:
+    """`fusion blend` with the window fixed, of all pairs or of the first alone."""
+    inputs = [pairs / role / f"000000{suffix}" if one_pair else pairs / role for role in ("rgb", "fir")]
     return [
-        *(str(FUSION), "blend", f"{pairs / 'rgb'}{only}", f"{pairs / 'fir'}{only}", "-o", str(out), "--quiet"),
+        *(str(FUSION), "blend", *map(str, inputs), "-o", str(out), "--quiet"),
         *("--window", str(case.window[0]), str(case.window[1]), "--window-unit", "counts"),
         *("--workers", str(workers), "--format", suffix.removeprefix(".")),
     ]
@@ -83,7 +85,8 @@ def machine_lines() -> list[str]:
     return [
         f"- processor: {_cpu_model()}, {len(os.sched_getaffinity(0))} cores to use",
         f"- memory: {memory:.0f} GiB; system: {platform.system()} {platform.release()}, {platform.machine()}",
-        f"- load average when the run began: {load:.2f}" + (" (**not quiet: figures are soft**)" if load > 0.5 else ""),
+        f"- load average when the run began: {load:.2f}"
+        + (" (**not quiet: figures are soft**)" if load > 0.5 else ""),
     ]
 
 

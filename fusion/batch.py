@@ -53,12 +53,16 @@ class RunReport:
         self.window_hi = _widened(self.window_hi, float(row.window_hi))
 
 
+def no_progress(done: int, total: int) -> None:
+    """Says nothing."""
+
+
 def run(
     fuser: Fuser,
     sink: FolderSink,
     *,
     workers: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] = no_progress,
 ) -> RunReport:
     """Fuse every pair of `fuser` into the open `sink`; frames that are there already are kept.
 

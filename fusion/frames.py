@@ -52,6 +52,14 @@ class FrameSet:
             raise ValueError(f"fir must be HxW counts, got {self.fir.pixels.shape}")
 
     @property
+    def bgr(self) -> NDArray[np.uint8]:
+        return np.asarray(self.rgb.pixels, np.uint8)  # no copy: what they are
+
+    @property
+    def counts(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        return self.fir.pixels
+
+    @property
     def stem(self) -> str:
         return self.rgb.stem
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numpy.typing import DTypeLike, NDArray
 
@@ -194,12 +196,27 @@ class _NoAlias(CompilerBase):
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 
 
+class _MachineCode(FunctionCache):
+    """Numba's store of machine code, where a full disk or a damaged file only means to compile again."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever unpickling rubbish may raise: begin anew
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(Exception):
+            super().save_overload(sig, data)
+
+
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    options: dict[str, Any] = {"nogil": True, "pipeline_class": _NoAlias}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # nowhere to keep machine code: every process compiles for itself
-        return numba.njit(function, **options)
+    loop: Any = numba.njit(function, nogil=True, pipeline_class=_NoAlias)
+    with suppress(RuntimeError):  # nowhere to keep machine code: every process compiles for itself
+        loop._cache = _MachineCode(function)  # what `cache=True` does, with our store
+    return loop
 
 
 # In the loops below every operation is cast back to its width: Numba widens integers to 64 bits, and

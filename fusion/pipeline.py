@@ -95,25 +95,25 @@ class Fuser:
         """The same frame as `fuse(index)`, with every step on the way."""
         frames = self.pairs.read(index)
         _, warp = self._warp_for(frames.fir.size_wh, frames.rgb.size_wh)
-        window = self.windows.window(index, frames.fir.pixels)
-        counts_index, below, above = index_counts(frames.fir.pixels, window.lo, window.hi)
+        window = self.windows.window(index, frames.counts)
+        stretched, below, above = index_counts(frames.counts, window.lo, window.hi)
         if self.config.thermal.clahe:
-            counts_index = equalise(counts_index, self.config.thermal.clahe)
-        warped = warp.apply(counts_index)
-        bgr, mask = self._blended(frames.rgb.pixels, warped, warp)
+            stretched = equalise(stretched, self.config.thermal.clahe)
+        warped = warp.apply(stretched)
+        bgr, mask = self._blended(frames.bgr, warped, warp)
         fused = FusedFrame(
             frames.stem,
             bgr,
             mask,
             window,
-            below / frames.fir.pixels.size,
-            above / frames.fir.pixels.size,
+            below / frames.counts.size,
+            above / frames.counts.size,
             warp.coverage,
             frames.rgb.stamp_ns,
             frames.fir.stamp_ns,
             _flags(frames, window),
         )
-        return Stages(frames, warp, counts_index, warped, self.table_bgr, fused)
+        return Stages(frames, warp, stretched, warped, self.table_bgr, fused)
 
     def _blended(
         self, bgr: NDArray[np.uint8], warped: NDArray[np.uint8], warp: Warp

@@ -1,9 +1,9 @@
 """The thermal image on the RGB grid: where it is valid, what a crop would keep, and the resampling.
 
 Pixel (0, 0) is the centre of the top-left pixel; `H_rgb_fir` takes thermal pixel coordinates to RGB ones.
-An RGB pixel is valid where its position lies on the thermal image, [-1/2, w - 1/2] x [-1/2, h - 1/2]: half a
-pixel beyond its outermost centres their value is drawn out. Positions are sampled in steps of 1/256 px, so half
-a step is let pass.
+An RGB pixel is valid where its position lies on the thermal image, [-1/2, w - 1/2] x [-1/2, h - 1/2]: in
+the last half pixel beyond the outermost centres their value is drawn out. Positions are sampled in steps of
+1/256 px, so half a step is let pass.
 """
 
 from __future__ import annotations
@@ -55,13 +55,12 @@ def fault_of(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size, rgb_size_wh: Siz
 def valid_spans(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size, rgb_size_wh: Size) -> Spans:
     """The valid columns of each RGB row, as half-open [first, stop): two int64 arrays, one value a row.
 
-    Valid is what lies on the thermal image's own area, [-1/2, w - 1/2] by [-1/2, h - 1/2]: half a pixel beyond
-    its outermost centres their value is drawn out. A row that has none gets (W, 0). `H_rgb_fir` must have no `fault_of`; then the valid region is convex
+    A row that has none gets (W, 0). `H_rgb_fir` must have no `fault_of`; then the valid region is convex
     and one interval a row says it all.
     """
     (w, h), (W, H) = fir_size_wh, rgb_size_wh
     x, y, z = _inverse(H_rgb_fir, fir_size_wh)
-    # -1/2 <= x/z <= w - 1/2 as half-planes of the RGB plane. Together they imply z > 0: nothing from behind passes.
+    # -1/2 <= x/z <= w - 1/2 as half-planes of the RGB plane. Together they imply z > 0: nothing from behind.
     edges = (
         x + _MARGIN_PX * z,
         (w - 1 + _MARGIN_PX) * z - x,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from fusion.sinks.index import read_rows
 from tests.worlds import read, tree, write, write_pairs
 
 
-def fuse_to(out: Path, rgb: Path, fir: Path, *, workers: int = 1, **groups: object) -> RunReport:
+def fuse_to(out: Path, rgb: Path, fir: Path, *, workers: int = 1, **groups: Any) -> RunReport:
     fuser = Fuser(open_pairs(rgb, fir), BlendConfig.of(**groups))
     with FolderSink(out, describe_run(fuser)) as sink:
         return run(fuser, sink, workers=workers)
@@ -77,7 +78,7 @@ def test_no_usable_frame_is_an_error(tmp_path: Path) -> None:
 
 def test_a_second_run_redoes_only_what_changed(tmp_path: Path) -> None:
     rgb, fir = write_pairs(tmp_path, 5)
-    fixed = {"thermal": {"window": (0.1, 0.9)}}
+    fixed: dict[str, Any] = {"thermal": {"window": (0.1, 0.9)}}
     fuse_to(tmp_path / "out", rgb, fir, **fixed)
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out/fused").iterdir()}
     assert fuse_to(tmp_path / "out", rgb, fir, **fixed).kept == 5
@@ -93,7 +94,7 @@ def test_sizes_that_change_midway(tmp_path: Path) -> None:
     rgb, fir = write_pairs(tmp_path, 4)
     write(rgb / "f002.png", np.zeros((24, 32, 3), np.uint8))
     write(fir / "f002.png", np.zeros((24, 32), np.uint8))
-    fixed = {"thermal": {"window": (0.0, 1.0)}}
+    fixed: dict[str, Any] = {"thermal": {"window": (0.0, 1.0)}}
     assert (
         fuse_to(tmp_path / "aligned", rgb, fir, **fixed).fused == 4
     )  # each pair is its own grid: nothing is lost

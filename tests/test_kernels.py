@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numba.core import config
 from numpy.typing import NDArray
 
 from fusion import kernels
@@ -357,3 +361,29 @@ def test_without_a_place_for_machine_code_a_loop_still_compiles() -> None:
     namespace: dict[str, Any] = {}
     exec("def twice(n):\n    return n + n", namespace)  # from no file: there is nothing to cache beside
     assert kernels._compiled(namespace["twice"])(21) == 42
+
+
+def test_damaged_or_unwritable_machine_code_is_compiled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "extra_loop.py").write_text("def twice(n):\n    return n + n\n")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "code"))
+    twice = importlib.import_module("extra_loop").twice
+
+    def found(n: int) -> bool:
+        """Whether a fresh process's first call would find machine code; the call itself must be right."""
+        loop: Any = kernels._compiled(twice)
+        assert loop(n) == 2 * n
+        return bool(loop.stats.cache_hits)
+
+    assert [found(1), found(2)] == [False, True]
+    for pattern in ("*.nbc", "*.nbi"):
+        for path in list((tmp_path / "code").rglob(pattern)):
+            path.write_bytes(b"")
+        assert [found(3), found(4)] == [False, True]  # and it was mended
+    loop: Any = kernels._compiled(twice)
+    shutil.rmtree(tmp_path / "code")
+    (tmp_path / "code").write_text("a file where the folder was")
+    assert loop(5) == 10

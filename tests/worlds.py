@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ def textured(rng: np.random.Generator, width: int, height: int) -> NDArray[np.fl
     """A smooth random field in [0, 1], H x W."""
     coarse = rng.random((height // 8 + 2, width // 8 + 2))
     field = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(field, 0, 1)
+    return np.clip(np.asarray(field, np.float64), 0, 1)
 
 
 def write_pairs(
@@ -40,15 +41,15 @@ def write_pairs(
     return rgb, fir
 
 
-def write(path: Path, pixels: NDArray[np.generic]) -> Path:
-    assert cv2.imwrite(str(path), pixels), path
+def write(path: Path, pixels: NDArray[Any]) -> Path:
+    assert cv2.imwrite(str(path), np.asarray(pixels)), path
     return path
 
 
-def read(path: Path) -> NDArray[np.uint8]:
+def read(path: Path) -> NDArray[Any]:
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert pixels is not None, path
-    return pixels
+    return np.asarray(pixels)
 
 
 def tree(folder: Path) -> dict[str, bytes]:

@@ -86,7 +86,7 @@ def blend(
     alpha: Annotated[float | None, Parameter(group=BLEND, help="Weight of RGB. Default: 0.85.")] = None,
     format: Annotated[
         Literal["png", "jpg"] | None, Parameter(group=BLEND, help="png is lossless. Default: png.")
-    ] = None,  # noqa: A002
+    ] = None,
     quality: Annotated[int | None, Parameter(group=BLEND, help="JPEG quality 1 to 100. Default: 90.")] = None,
     workers: Annotated[
         int | None, Parameter(group=RUN, help="Threads. Default: one a core; the output is the same.")

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fusion.batch import opencv_on_one_thread, run
+from fusion.batch import no_progress, opencv_on_one_thread, run
 from fusion.codecs import encode_png
 from fusion.config import BlendConfig, load_config
 from fusion.errors import InputError, OutputError, UsageError
@@ -99,7 +99,7 @@ def run_blend(
             return
         if not quiet:
             print("\n".join(plan_lines(fuser)), flush=True)
-        with _sink(fuser, out, overwrite) as sink:
+        with quiet_libraries(), _sink(fuser, out, overwrite) as sink:
             if preview:
                 sink.write_file(PREVIEW, _preview_png(fuser))
             with progress_bar(quiet) as progress:
@@ -126,7 +126,7 @@ def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | Non
     manifest = load_manifest(dataset)
     if not manifest.registered and not (settings.warp.homography or settings.warp.points):
         raise InputError(
-            "its thermal images are not registered to its RGB images, and blending them as they are would be wrong",
+            "its thermal images are not registered to its RGB images: as they are, they do not fit",
             where=f"data set {manifest.name}",
             hint="give --homography FILE or --points CSV",
         )
@@ -170,7 +170,7 @@ def fixed_folder(spec: str) -> Path | None:
         return path.resolve()
     if path.exists():
         return None
-    fixed = [part for part in path.parts]
+    fixed = list(path.parts)
     for depth, part in enumerate(fixed):
         if any(mark in part for mark in "*?["):
             return Path(*fixed[:depth]).resolve()
@@ -181,7 +181,7 @@ def fixed_folder(spec: str) -> Path | None:
 def progress_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar with rate and time left on the terminal; nothing where there is none."""
     if quiet or not sys.stderr.isatty():
-        yield lambda done, total: None
+        yield no_progress
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -201,6 +201,31 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
             bar.update(task, completed=done, total=total, rate=rate)
 
         yield advance
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Sends what C libraries write to standard error nowhere; Python's own words still arrive.
+
+    libpng and libtiff announce every damaged file by themselves; the frame is named in our report already.
+    """
+    sys.stderr.flush()
+    before, terminal = sys.stderr, os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        if before.fileno() == 2:
+            sys.stderr = os.fdopen(
+                os.dup(terminal), "w", buffering=1, encoding=before.encoding, errors="replace"
+            )
+        yield
+    finally:
+        if sys.stderr is not before:
+            sys.stderr.close()
+            sys.stderr = before
+        os.dup2(terminal, 2)
+        os.close(terminal)
+        os.close(nowhere)
 
 
 def default_workers() -> int:

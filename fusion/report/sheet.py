@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.errors import FrameError, InputError
+from fusion.kernels import index_counts
 from fusion.pipeline import Fuser, Stages
 
 PANEL_WIDTH, CAPTION_HEIGHT, GAP = 320, 26, 4
@@ -36,7 +37,7 @@ def contact_sheet(fuser: Fuser, frames: int = 5) -> NDArray[np.uint8]:
 
 def panels(stages: Stages) -> dict[str, NDArray[np.uint8]]:
     """The pictures of one frame by title (BGR uint8, each on its own grid), in the order of the steps."""
-    bgr, counts = stages.frames.rgb.pixels, stages.frames.fir.pixels
+    bgr, counts = stages.frames.bgr, stages.frames.counts
     inside = stages.warp.mask[..., None] > 0
     grey = cv2.cvtColor(_full_range(counts), cv2.COLOR_GRAY2BGR)
     onto_rgb = cv2.addWeighted(bgr, 0.5, cv2.cvtColor(stages.warped, cv2.COLOR_GRAY2BGR), 0.5, 0)
@@ -47,7 +48,7 @@ def panels(stages: Stages) -> dict[str, NDArray[np.uint8]]:
         np.where(inside, stages.overlay_bgr, np.uint8(PAPER)),
         stages.fused.bgr,
     )
-    return dict(zip(TITLES, pictures, strict=True))
+    return {title: np.asarray(picture, np.uint8) for title, picture in zip(TITLES, pictures, strict=True)}
 
 
 def _row(stages: Stages) -> NDArray[np.uint8]:
@@ -61,18 +62,19 @@ def _row(stages: Stages) -> NDArray[np.uint8]:
 
 
 def _full_range(counts: NDArray[np.uint8] | NDArray[np.uint16]) -> NDArray[np.uint8]:
-    return cv2.normalize(counts, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)  # type: ignore[call-overload]
+    lo, hi = int(counts.min()), int(counts.max())
+    return index_counts(counts, lo, max(hi, lo + 1))[0]
 
 
 def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height = max(1, round(picture.shape[0] * PANEL_WIDTH / picture.shape[1]))
     way = cv2.INTER_AREA if picture.shape[1] > PANEL_WIDTH else cv2.INTER_LINEAR
-    return cv2.resize(picture, (PANEL_WIDTH, height), interpolation=way)
+    return np.asarray(cv2.resize(picture, (PANEL_WIDTH, height), interpolation=way), np.uint8)
 
 
 def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
     bottom = height - picture.shape[0]
-    return cv2.copyMakeBorder(picture, 0, bottom, 0, GAP, cv2.BORDER_CONSTANT, value=(PAPER,) * 3)
+    return np.pad(picture, ((0, bottom), (0, GAP), (0, 0)), constant_values=PAPER)
 
 
 def _captions(texts: Sequence[str], width: int = PANEL_WIDTH + GAP) -> NDArray[np.uint8]:

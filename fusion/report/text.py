@@ -24,21 +24,11 @@ def plan_lines(fuser: Fuser) -> list[str]:
         ("coverage", f"{warp.coverage:.1%} of RGB"),
     ]
     if not warp.full:
+        crop = f"crop to {width}x{height} at ({x}, {y})"
         rows.append(("border", f"left {left}, top {top}, right {right}, bottom {bottom} px"))
-        rows.append(
-            (
-                "outside",
-                f"crop to {width}x{height} at ({x}, {y})"
-                if config.warp.outside == "crop"
-                else config.warp.outside,
-            )
-        )
-    rows.append(
-        (
-            "preset",
-            f"{config.preset}: colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}",
-        )
-    )
+        rows.append(("outside", crop if config.warp.outside == "crop" else config.warp.outside))
+    colours = f"colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}"
+    rows.append(("preset", f"{config.preset}: {colours}"))
     return [*_table(rows), *(f"note: {note}" for note in pairing.notes)]
 
 

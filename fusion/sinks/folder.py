@@ -23,6 +23,7 @@ from typing import IO, Any
 import numpy as np
 import tomlkit
 from numpy.typing import NDArray
+from tomlkit.exceptions import TOMLKitError
 
 from fusion.codecs import encode_jpeg, encode_png
 from fusion.errors import OutputError
@@ -111,10 +112,8 @@ class FolderSink:
         return None
 
     def write(self, frame: FusedFrame, fir_stem: str) -> Row:
-        if self._suffix == ".png":
-            data = encode_png(frame.bgr)
-        else:
-            data = encode_jpeg(frame.bgr, self._quality)
+        lossless = self._suffix == ".png"
+        data = encode_png(frame.bgr) if lossless else encode_jpeg(frame.bgr, self._quality)
         if frame.mask is not None:
             self._replace(self.out / "mask" / f"{frame.stem}.png", self._mask_png(frame.mask))
         self._replace(self._frame_path(frame.stem), data)
@@ -177,7 +176,7 @@ class FolderSink:
             return
         try:
             before = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
-        except (ValueError, tomlkit.exceptions.TOMLKitError) as error:
+        except (ValueError, TOMLKitError) as error:
             raise OutputError(f"its run.toml cannot be read: {error}", where=self.out, hint=hint) from None
         difference = first_difference(before, self._run)
         if difference:

@@ -37,13 +37,14 @@ class Row:
 
     @classmethod
     def fused(cls, frame: FusedFrame, fir_stem: str, size: int) -> Row:
-        stamps = (frame.rgb_stamp_ns, frame.fir_stamp_ns)
-        dt_ns = None if None in stamps else stamps[1] - stamps[0]  # type: ignore[operator]
+        rgb_ns, fir_ns = frame.rgb_stamp_ns, frame.fir_stamp_ns
         return cls(
             frame.stem,
             fir_stem,
             "fused",
-            *("" if value is None else str(value) for value in (*stamps, dt_ns)),
+            "" if rgb_ns is None else str(rgb_ns),
+            "" if fir_ns is None else str(fir_ns),
+            "" if rgb_ns is None or fir_ns is None else str(fir_ns - rgb_ns),
             f"{frame.window.lo:.9g}",
             f"{frame.window.hi:.9g}",
             f"{frame.clipped_below:.6f}",
