@@ -214,10 +214,8 @@ def quiet_libraries() -> Iterator[None]:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        if before.fileno() == 2:
-            sys.stderr = os.fdopen(
-                os.dup(terminal), "w", buffering=1, encoding=before.encoding, errors="replace"
-            )
+        if before is sys.__stderr__:
+            sys.stderr = os.fdopen(os.dup(terminal), "w", buffering=1, errors="backslashreplace")
         yield
     finally:
         if sys.stderr is not before:

@@ -12,9 +12,9 @@ from fusion.errors import FusionError
 
 BLEND_HELP = (
     "Fuse RGB and thermal images into a folder of frames.\n\n"
-    "Thermal is paired with RGB, windowed, warped onto the RGB grid, coloured and blended in. OUT gets fused/,"
-    " mask/ (where thermal does not cover the frame), frames.csv and run.toml. The same command run again keeps"
-    " finished frames."
+    "Thermal is paired with RGB, windowed, warped onto the RGB grid, coloured and blended in."
+    " OUT gets fused/, mask/ (where thermal does not cover the frame), frames.csv and run.toml."
+    " The same command run again keeps finished frames."
 )
 BLEND_EXAMPLES = """Examples:
   fusion blend rgb/ fir/ -o out/ --preview
