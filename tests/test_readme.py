@@ -47,7 +47,8 @@ def blocks(document: Path) -> list[Block]:
 
 
 def name_of(value: object) -> str:
-    return value.name if isinstance(value, Path) else str(value)
+    """What pytest calls a document, or a line of one, in its report."""
+    return value.relative_to(ROOT).as_posix() if isinstance(value, Path) else str(value).split(" ")[0]
 
 
 def prose(document: Path) -> str:
@@ -226,7 +227,7 @@ def commented_settings() -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize(("table", "line"), commented_settings())
+@pytest.mark.parametrize(("table", "line"), commented_settings(), ids=name_of)
 def test_documented_alternatives_are_right_in_a_file_of_their_own(
     tmp_path: Path, table: str, line: str
 ) -> None:
