@@ -18,7 +18,7 @@ import cv2
 
 from fusion.errors import FrameError, InputError
 from fusion.pipeline import Fuser
-from fusion.sinks.folder import FolderSink
+from fusion.sinks.base import Sink
 from fusion.sinks.index import Row
 
 IN_FLIGHT_PER_WORKER = 3
@@ -59,7 +59,7 @@ def no_progress(done: int, total: int) -> None:
 
 def run(
     fuser: Fuser,
-    sink: FolderSink,
+    sink: Sink,
     *,
     workers: int = 1,
     progress: Callable[[int, int], None] = no_progress,

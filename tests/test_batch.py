@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ import pytest
 
 from fusion import BlendConfig, FolderSink, FrameError, Fuser, InputError, describe_run, open_pairs, run
 from fusion.batch import RunReport, opencv_on_one_thread
-from fusion.sinks.index import read_rows
+from fusion.frames import FusedFrame
+from fusion.sinks.index import Row, read_rows
 from tests.worlds import read, tree, write, write_pairs
 
 
@@ -168,3 +170,33 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path) -> No
         assert "kept from before" in again.stdout
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+class Shelf:
+    """A sink that keeps frames in memory: that `run` needs no more than the protocol."""
+
+    def __init__(self) -> None:
+        self.frames: list[FusedFrame] = []
+        self.rows: list[Row] = []
+
+    def expect(self, stems: Iterable[str]) -> None:
+        assert len(set(stems)) == 3
+
+    def finished(self, stem: str, changed_ns: int) -> Row | None:
+        assert changed_ns > 0
+        return Row(stem, stem, "fused", "", "", "", "0", "1", "0", "0", "1") if stem == "f001" else None
+
+    def write(self, frame: FusedFrame, fir_stem: str) -> Row:
+        self.frames.append(frame)
+        return Row.fused(frame, fir_stem, 0)
+
+    def record(self, row: Row) -> None:
+        self.rows.append(row)
+
+
+def test_any_sink_will_do(tmp_path: Path) -> None:
+    shelf = Shelf()
+    report = run(Fuser(open_pairs(*write_pairs(tmp_path, 3))), shelf)
+    assert (report.fused, report.kept) == (2, 1)
+    assert [frame.stem for frame in shelf.frames] == ["f000", "f002"]
+    assert [row.stem for row in shelf.rows] == ["f000", "f001", "f002"]

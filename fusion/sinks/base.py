@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
 
 from fusion.frames import FusedFrame
@@ -14,6 +15,10 @@ class Sink(Protocol):
     A sink is a context manager: leaving it after an error keeps what was recorded, so that the same
     run can go on; leaving it normally completes the output.
     """
+
+    def expect(self, stems: Iterable[str]) -> None:
+        """Refuse names that this sink cannot keep apart. Raises `OutputError`."""
+        ...
 
     def finished(self, stem: str, changed_ns: int) -> Row | None:
         """The row of a frame that is there already and no older than `changed_ns`, else None."""
