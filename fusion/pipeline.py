@@ -111,7 +111,7 @@ class Fuser:
             warp.coverage,
             frames.rgb.stamp_ns,
             frames.fir.stamp_ns,
-            _flags(frames, window),
+            self._flags(frames, window),
         )
         return Stages(frames, warp, stretched, warped, self.table_bgr, fused)
 
@@ -129,6 +129,11 @@ class Fuser:
         if outside == "fill":
             fused[warp.mask == 0] = self.config.warp.fill_bgr
         return fused, warp.mask
+
+    def _flags(self, frames: FrameSet, window: Window) -> tuple[str, ...]:
+        # percentiles that coincide: the planner widened them to one count
+        flat = self.config.thermal.window_unit == "percentile" and window.hi - window.lo <= 1
+        return (*frames.rgb.flags, *frames.fir.flags, *(("fir-flat",) if flat else ()))
 
     def _read_registration(self) -> reg.Registration | None:
         warp = self.config.warp
@@ -184,11 +189,6 @@ class Fuser:
         except UsageError as error:
             given = self.config.warp.homography or self.config.warp.points
             raise UsageError(error.what, where=given or error.where, hint=error.hint) from None
-
-
-def _flags(frames: FrameSet, window: Window) -> tuple[str, ...]:
-    flat = ("fir-flat",) if window.hi - window.lo <= 1 else ()
-    return (*frames.rgb.flags, *frames.fir.flags, *flat)
 
 
 def _wh(size_wh: tuple[int, int]) -> str:

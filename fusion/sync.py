@@ -20,6 +20,7 @@ class Pairs(Protocol):
 
     name: str
     pairing: Pairing
+    ignored: int  # how many other files the sources left alone
 
     def __len__(self) -> int: ...
 
@@ -36,7 +37,7 @@ class Pairs(Protocol):
         ...
 
     def changed_ns(self, index: int) -> int:
-        """When the files of a pair last changed (0 where they are not files of their own)."""
+        """When the files that a pair lies in last changed (0 where there are none)."""
         ...
 
     def close(self) -> None: ...
@@ -48,6 +49,7 @@ class PairedSources:
     def __init__(self, rgb: Source, fir: Source, rule: PairingRule) -> None:
         self.name = f"{rgb.name} + {fir.name}"
         self.pairing = pair(rgb.entries, fir.entries, rule)
+        self.ignored = rgb.ignored + fir.ignored
         self._rgb, self._fir = rgb, fir
         by_time = self.pairing.rule_by == "stamp"  # the stamps may stand in the names alone
         self._rgb_stamps = stamps_of(rgb.entries, rule.rgb_key) if by_time else None
@@ -85,6 +87,7 @@ class PairedChannels:
     def __init__(self, files: RgbtFiles) -> None:
         self.name = files.name
         self.pairing = Pairing.of_channels(len(files.entries))
+        self.ignored = files.ignored
         self._files = files
 
     def __len__(self) -> int:
@@ -134,6 +137,6 @@ def _read(source: Source, index: int, stamps: Sequence[int | None] | None) -> Im
 def _changed_ns(entries: Sequence[Entry]) -> int:
     changed = 0
     for entry in entries:
-        with suppress(OSError):  # a frame of a video is no file of its own
-            changed = max(changed, Path(entry.where).stat().st_mtime_ns)
+        with suppress(OSError):  # a source that is no file has no such time
+            changed = max(changed, Path(entry.file or entry.where).stat().st_mtime_ns)
     return changed

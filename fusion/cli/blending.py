@@ -235,7 +235,7 @@ def unmatched_csv(pairs: Pairs) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("role", "name", "reason"))
-    writer.writerows((lost.role, Path(lost.where).name, lost.reason) for lost in pairs.pairing.unmatched)
+    writer.writerows((lost.role, lost.where, lost.reason) for lost in pairs.pairing.unmatched)
     return text.getvalue().encode("utf-8", "surrogateescape")
 
 

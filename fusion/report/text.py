@@ -23,6 +23,8 @@ def plan_lines(fuser: Fuser) -> list[str]:
         ("registration", _registration(fuser)),
         ("coverage", f"{warp.coverage:.1%} of RGB"),
     ]
+    if fuser.pairs.ignored:
+        rows.insert(1, ("ignored", f"{fuser.pairs.ignored} other files in the inputs"))
     if not warp.full:
         crop = f"crop to {width}x{height} at ({x}, {y})"
         rows.append(("border", f"left {left}, top {top}, right {right}, bottom {bottom} px"))

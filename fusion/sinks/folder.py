@@ -87,42 +87,50 @@ class FolderSink:
             self._close()
 
     def expect(self, stems: Iterable[str]) -> None:
-        """Refuse, before anything is written, names that would fall onto one file on this disk."""
+        """Refuse, before a frame is written, names that would fall onto one file on this disk."""
         (self.out / "fused").mkdir(exist_ok=True)
-        if not (self.out / "FUSED").exists():
-            return
+        blind_to_case = (self.out / "FUSED").exists()
         seen: dict[str, str] = {}
         for stem in stems:
-            other = seen.setdefault(stem.casefold(), stem)
-            if other != stem:
+            file = stem.casefold() if blind_to_case else stem
+            if file in seen:
                 raise OutputError(
-                    f"{other!r} and {stem!r} differ only in case, which this disk does not tell apart",
+                    f"{seen[file]!r} and {stem!r} would be one file: one would overwrite the other",
                     where=self.out,
-                    hint="rename one of them, or write to another disk",
+                    hint="rename one of the images",
                 )
+            seen[file] = stem
 
     def finished(self, stem: str, changed_ns: int) -> Row | None:
         row = self._done.get(stem)
         if row is None:
             return None
         with suppress(OSError, ValueError):
-            stat = self._frame_path(stem).stat()
-            if stat.st_size == int(row.size) and stat.st_mtime_ns >= changed_ns:
+            frame = self._frame_path(stem).stat()
+            whole = frame.st_size == int(row.size)
+            if row.mask_size:
+                whole = whole and self._mask_path(stem).stat().st_size == int(row.mask_size)
+            if whole and frame.st_mtime_ns >= changed_ns:
                 return row
         return None
 
     def write(self, frame: FusedFrame, fir_stem: str) -> Row:
         lossless = self._suffix == ".png"
         data = encode_png(frame.bgr) if lossless else encode_jpeg(frame.bgr, self._quality)
+        mask_size = None
         if frame.mask is not None:
-            self._replace(self.out / "mask" / f"{frame.stem}.png", self._mask_png(frame.mask))
+            mask = self._mask_png(frame.mask)
+            mask_size = len(mask)
+            self._replace(self._mask_path(frame.stem), mask)
         self._replace(self._frame_path(frame.stem), data)
-        return Row.fused(frame, fir_stem, len(data))
+        return Row.fused(frame, fir_stem, len(data), mask_size)
 
     def record(self, row: Row) -> None:
         if self._journal is None:
             raise OutputError("the sink is not open", where=self.out, hint="use it in a with block")
         self._rows.append(row)
+        if row.status == "skipped" and row.stem in self._done:
+            self._unlink(row.stem)  # its inputs were good once: what is left of it is stale
         if row.status == "fused" and self._done.get(row.stem) != row:
             try:
                 self._journal.write(to_csv([row], header=False))
@@ -209,6 +217,10 @@ class FolderSink:
             self._lock_fd = None
 
     # --- files
+
+    def _unlink(self, stem: str) -> None:
+        for path in (*(self._frame_path(stem, s) for s in (".png", ".jpg")), self._mask_path(stem)):
+            path.unlink(missing_ok=True)
 
     def _frame_path(self, stem: str, suffix: str | None = None) -> Path:
         return self.out / "fused" / f"{_inside(stem)}{suffix or self._suffix}"

@@ -17,7 +17,7 @@ class Row:
     """One pair. `status` is ``fused`` or ``skipped`` (then `reason` says why and the rest is empty).
 
     Stamps and `dt_ns` are integer nanoseconds, windows are thermal counts, clipped and coverage are
-    shares [0, 1], `size` is the fused file's length in bytes.
+    shares [0, 1], `size` and `mask_size` are the lengths of the files in bytes.
     """
 
     stem: str
@@ -32,11 +32,12 @@ class Row:
     clipped_above: str = ""
     coverage: str = ""
     size: str = ""
+    mask_size: str = ""
     flags: str = ""
     reason: str = ""
 
     @classmethod
-    def fused(cls, frame: FusedFrame, fir_stem: str, size: int) -> Row:
+    def fused(cls, frame: FusedFrame, fir_stem: str, size: int = 0, mask_size: int | None = None) -> Row:
         rgb_ns, fir_ns = frame.rgb_stamp_ns, frame.fir_stamp_ns
         return cls(
             frame.stem,
@@ -51,6 +52,7 @@ class Row:
             f"{frame.clipped_above:.6f}",
             f"{frame.coverage:.6f}",
             str(size),
+            "" if mask_size is None else str(mask_size),
             ";".join(frame.flags),
         )
 

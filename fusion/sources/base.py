@@ -16,12 +16,14 @@ class Entry:
     """One image of a source, not read yet.
 
     `stem` is its posix path relative to the source, without suffix; `where` is what messages call it
-    (a path, or ``clip.mp4 frame 12``); `stamp_ns` is its time where the container itself has a clock.
+    (a path, or ``clip.mp4 frame 12``); `stamp_ns` is its time where the container itself has a clock;
+    `file` is the file that it lies in, where `where` is not that itself.
     """
 
     stem: str
     where: str
     stamp_ns: int | None = None
+    file: str = ""
 
 
 @runtime_checkable
@@ -30,6 +32,7 @@ class Source(Protocol):
 
     name: str
     entries: Sequence[Entry]
+    ignored: int  # how many other files were there and left alone
 
     def read(self, index: int) -> Image:
         """Decode entry `index`. Raises `FrameError` when that one image cannot be used."""

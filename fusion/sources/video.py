@@ -309,7 +309,9 @@ def _entries(spec: str, index: _Index) -> list[Entry]:
     name, count = Path(spec).name, len(index.pts) + index.missing
     digits = max(6, len(str(count - 1)))
     stamps = [*(round(pts * index.time_base * 10**9) for pts in index.pts), *[None] * index.missing]
-    return [Entry(f"frame_{i:0{digits}d}", f"{name} frame {i}", stamp) for i, stamp in enumerate(stamps)]
+    return [
+        Entry(f"frame_{i:0{digits}d}", f"{name} frame {i}", stamp, spec) for i, stamp in enumerate(stamps)
+    ]
 
 
 def _open_video(spec: str, role: Role, *, fir_colour: FirColour, max_pixels: int) -> VideoSource:

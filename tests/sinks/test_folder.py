@@ -170,4 +170,32 @@ def test_first_difference_names_the_deepest_key() -> None:
     assert first_difference({"a": {"b": [1, 2]}}, {"a": {"b": (1, 2)}}) is None
     assert first_difference({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}) == "a.b was 2, is 3"
     assert first_difference({"a": 1}, {}) == "a was 1, is not there"
-    assert len(COLUMNS) == 14
+    assert len(COLUMNS) == 15
+
+
+def test_two_pairs_of_one_name_are_refused_before_one_overwrites_the_other(tmp_path: Path) -> None:
+    sink = FolderSink(tmp_path / "out")
+    with pytest.raises(OutputError, match="two pairs are called 'a'"), sink:
+        sink.expect(["a", "b", "a"])
+    with FolderSink(tmp_path / "out") as again:
+        again.expect(["a", "A"])  # this disk tells them apart
+
+
+def test_a_frame_whose_mask_is_gone_is_not_finished(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_all(out, frame("a", mask=True))
+    with FolderSink(out, {"config": {"alpha": 0.85}}) as sink:
+        assert sink.finished("a", 0) is not None
+        (out / "mask/a.png").unlink()
+        assert sink.finished("a", 0) is None
+
+
+def test_a_frame_that_is_skipped_now_leaves_nothing_stale(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write_all(out, frame("a", mask=True), frame("b"))
+    with FolderSink(out, {"config": {"alpha": 0.85}}) as sink:
+        sink.record(Row.skipped("a", "a", FrameError("gone bad")))
+        kept = sink.finished("b", 0)
+        assert kept is not None
+        sink.record(kept)
+    assert sorted(tree(out)) == ["frames.csv", "fused/b.png", "run.toml"]
