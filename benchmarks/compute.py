@@ -86,7 +86,7 @@ class Jobs:
         fused = cv2.addWeighted(self.bgr, ALPHA, cv2.applyColorMap(warped, self.table_cv), 1 - ALPHA, 0)
         if self.mask is not None:
             cv2.copyTo(self.bgr, cv2.bitwise_not(self.warp.mask), fused)
-        return np.asarray(fused)
+        return np.asarray(fused, np.uint8)
 
     def check(self) -> None:
         """All ways give the same pixels, but for rounding."""

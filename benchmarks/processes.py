@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -73,7 +74,7 @@ class Processes:
         run_clocked(blend_command(case, pairs, ours, workers=2, suffix=kind.suffix))
         if rivals.FFMPEG:
             png = kind.suffix == ".png"
-            outputs = rivals.PNG_OUTPUTS if png else [self._jpeg_output(kind, pairs, ours / "fused")]
+            outputs = rivals.PNG_OUTPUTS if png else self._jpeg_outputs(pairs, ours / "fused")
             kind.ffmpeg = rivals.tune(pairs, self.space.out, case, count, kind.suffix, outputs)
             rivals.run_ffmpeg(kind.ffmpeg[0][0], pairs, self.space.out, case, count, kind.suffix)
             self._compare(kind, "ffmpeg", ours / "fused")
@@ -96,14 +97,14 @@ class Processes:
             f" its files are {size:.2f} times as large."
         )
 
-    def _jpeg_output(self, kind: Kind, pairs: Path, ours: Path) -> tuple[str, ...]:
-        """The `-q:v` whose files come nearest to ours in size."""
+    def _jpeg_outputs(self, pairs: Path, ours: Path) -> list[tuple[str, ...]]:
+        """With the `-q:v` whose files come nearest to ours in size."""
         wanted, sizes = _bytes(ours, 3), {}
         for quality in range(1, 10):
-            output = ("-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-q:v", str(quality))
-            rivals.run_ffmpeg(rivals.Ffmpeg("lut2", output), pairs, self.space.out, CASES[0], 3, kind.suffix)
-            sizes[output] = _bytes(self.space.out, 3) / wanted
-        return min(sizes, key=lambda output: abs(sizes[output] - 1))
+            how = rivals.Ffmpeg("YUV: lut2", rivals.jpeg_outputs(quality)[0])
+            rivals.run_ffmpeg(how, pairs, self.space.out, CASES[0], 3, ".jpg")
+            sizes[quality] = _bytes(self.space.out, 3) / wanted
+        return rivals.jpeg_outputs(min(sizes, key=lambda quality: abs(math.log(sizes[quality]))))
 
     # --- measured
 

@@ -23,7 +23,6 @@ FFMPEG = shutil.which("ffmpeg")
 # Debian's name first: "convert" may be anything
 MAGICK = shutil.which("convert-im6.q16") or shutil.which("convert")
 ALPHA = 0.85
-ALL_MEANS_SHARE = 255 * (1 - ALPHA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,7 @@ class Ffmpeg:
                 "-i",
                 str(pairs / f"fir/%06d{suffix}"),
             ),
-            *("-filter_complex", GRAPHS[self.graph].format(**expressions(case))),
+            *("-filter_complex", {**GRAPHS, **JPEG_GRAPHS}[self.graph].format(**expressions(case))),
             *("-frames:v", str(count), "-fps_mode", "passthrough", "-start_number", "0"),
             *(*self.output, "-threads", str(self.encode_threads), str(out / f"%06d{suffix}")),
         ]
@@ -60,22 +59,33 @@ class Ffmpeg:
         return f"{self.graph}; {' '.join(self.output)}; {threads} (decode/filter/encode)"
 
 
-# Window and colour map are one table each for red, green and blue. {index} windows 16-bit counts to 8 bit.
+# Window and colour map are one table each for red, green and blue (or Y, U, V). {counts} gives 8-bit counts,
+# mergeplanes lays them into all three planes. The first graphs blend by alpha, those of the second group
+# have the weights in the tables and add in SIMD, lut2 does all of it in one table of 256 x 256 a channel.
+_RGB, _FIR = "[0:v]format=gbrp[r];", "[1:v]{counts},mergeplanes=0x000000:gbrp"
 GRAPHS = {
-    # alpha blend as such
-    "lutrgb + blend=normal": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];"
-    "[r][t]blend=all_mode=normal:all_opacity=0.85",
-    "lutrgb + mix": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp,lutrgb={colour}[t];"
-    "[r][t]mix=weights='0.85 0.15'",
-    "lutrgb with alpha + overlay": "[0:v]format=gbrp[r];[1:v]{index}format=gbrap,lutrgb={colour}:a=38[t];"
-    "[r][t]overlay=format=gbrp",
-    # the weights in the tables, the sum in SIMD
-    "lutrgb x2 + blend=addition, planar": "[0:v]format=gbrp,lutrgb={weighted}[r];"
-    "[1:v]{index}format=gbrp,lutrgb={share}[t];[r][t]blend=all_mode=addition",
-    "lutrgb x2 + blend=addition, packed": "[0:v]format=rgb24,lutrgb={weighted}[r];"
-    "[1:v]{index}format=rgb24,lutrgb={share}[t];[r][t]blend=all_mode=addition",
-    # window, colours and blend in one table of 256 x 256 a channel
-    "lut2": "[0:v]format=gbrp[r];[1:v]{index}format=gbrp[t];[r][t]lut2={table}",
+    "lutrgb, blend=normal": _RGB + _FIR + ",lutrgb={colour}[t];[r][t]blend=all_mode=normal:all_opacity=0.85",
+    "lutrgb, mix": _RGB + _FIR + ",lutrgb={colour}[t];[r][t]mix=weights='0.85 0.15'",
+    "lutrgb with alpha, overlay": _RGB
+    + "[1:v]{counts},format=gbrap,lutrgb={colour}:a=38[t];[r][t]overlay=format=gbrp",
+    "lutrgb twice, blend=addition, planar": "[0:v]format=gbrp,lutrgb={weighted}[r];"
+    + _FIR
+    + ",lutrgb={share}[t];[r][t]blend=all_mode=addition",
+    "lutrgb twice, blend=addition, packed": "[0:v]format=rgb24,lutrgb={weighted}[r];"
+    "[1:v]{counts},format=rgb24,lutrgb={share}[t];[r][t]blend=all_mode=addition",
+    "lut2": _RGB + _FIR + "[t];[r][t]lut2={table}",
+}
+# JPEG need not leave YUV
+_FIR_YUV = "[1:v]{counts},mergeplanes=0x000000:yuvj444p"
+JPEG_GRAPHS = {
+    "lut2": GRAPHS["lut2"],
+    "YUV: lut2": "[0:v]format=yuvj420p[r];" + _FIR_YUV + ",format=yuvj420p[t];[r][t]lut2={table_yuv}",
+    "YUV: lutyuv twice, blend=addition": "[0:v]format=yuvj420p,lutyuv={weighted_yuv}[r];"
+    + _FIR_YUV
+    + ",lutyuv={share_yuv},format=yuvj420p[t];[r][t]blend=all_mode=addition",
+    "YUV: lutyuv, blend=normal": "[0:v]format=yuvj420p[r];"
+    + _FIR_YUV
+    + ",lutyuv={colour_yuv},format=yuvj420p[t];[r][t]blend=all_mode=normal:all_opacity=0.85",
 }
 PNG_OUTPUTS = tuple(
     ("-c:v", "png", "-compression_level", level, "-pred", pred)
@@ -85,31 +95,51 @@ PNG_STORED = ("-c:v", "png", "-compression_level", "0", "-pred", "none")
 
 
 def expressions(case: Case) -> dict[str, str]:
-    """The window and the map `hsv-cold-hot` as ffmpeg expressions: hue from 4/6 (blue) down to 0 (red)."""
+    """The window and the map `hsv-cold-hot` as ffmpeg expressions in every form that the graphs need."""
     lo, hi = case.window if case.bits == 8 else (0, 255)
+    of_val, of_y = _channels("val", lo, hi), _channels("y", lo, hi)
 
-    def channels(value: str) -> dict[str, str]:
-        sixths = f"4*(1-clip(({value}-{lo})/{hi - lo},0,1))"
-        return {
-            "r": f"clip(2-{sixths},0,1)",
-            "g": f"clip(min({sixths},4-{sixths}),0,1)",
-            "b": f"clip({sixths}-2,0,1)",
-        }
+    def scaled(channels: str, weight: float) -> str:
+        return ":".join(f"{c}='round({weight}*{of_val[c]})'" for c in channels)
 
-    of_val, of_y = channels("val"), channels("y")
-    table = [f"c{i}='floor({ALPHA}*x+{ALL_MEANS_SHARE}*{of_y[c]}+0.5)'" for i, c in enumerate("gbr")]
+    def table(channels: str) -> str:
+        terms = enumerate(channels)
+        return ":".join(f"c{i}='floor({ALPHA}*x+{1 - ALPHA:.2f}*{of_y[c]}+0.5)'" for i, c in terms)
+
     return {
-        "index": _index_16(case) if case.bits == 16 else "format=gray,",
-        "colour": ":".join(f"{c}='round(255*{of_val[c]})'" for c in "rgb"),
-        "share": ":".join(f"{c}='round({ALL_MEANS_SHARE}*{of_val[c]})'" for c in "rgb"),
+        "counts": _index_16(case) if case.bits == 16 else "format=gray",
+        "colour": scaled("rgb", 1),
+        "share": scaled("rgb", round(1 - ALPHA, 2)),
         "weighted": ":".join(f"{c}='round({ALPHA}*val)'" for c in "rgb"),
-        "table": ":".join(table),
+        "table": table("gbr"),
+        "colour_yuv": scaled("yuv", 1),
+        "share_yuv": scaled("yuv", round(1 - ALPHA, 2)),
+        "weighted_yuv": ":".join(f"{c}='round({ALPHA}*val)'" for c in "yuv"),
+        "table_yuv": table("yuv"),
+    }
+
+
+def _channels(value: str, lo: int, hi: int) -> dict[str, str]:
+    """Each channel, 0 to 255: hue from 4/6 (blue) down to 0 (red), and the same in JPEG's YUV."""
+    sixths = f"4*(1-clip(({value}-{lo})/{hi - lo},0,1))"
+    r, b = f"255*clip(2-{sixths},0,1)", f"255*clip({sixths}-2,0,1)"
+    g = f"255*clip(min({sixths},4-{sixths}),0,1)"
+    return {
+        **{"r": r, "g": g, "b": b},
+        "y": f"(0.299*{r}+0.587*{g}+0.114*{b})",
+        "u": f"(128-0.168736*{r}-0.331264*{g}+0.5*{b})",
+        "v": f"(128+0.5*{r}-0.418688*{g}-0.081312*{b})",
     }
 
 
 def _index_16(case: Case) -> str:
     lo, hi = case.window
-    return f"format=gray16,lut=y='256*round(255*clip((val-{lo})/{hi - lo},0,1))',format=gray,"
+    return f"format=gray16,lut=y='256*round(255*clip((val-{lo})/{hi - lo},0,1))',format=gray"
+
+
+def jpeg_outputs(quality: int) -> list[tuple[str, ...]]:
+    written = ("-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-qmin", "1", "-q:v", str(quality))
+    return [(*written, "-huffman", tables) for tables in ("default", "optimal")]
 
 
 def tune(
@@ -126,7 +156,8 @@ def tune(
                 )
         return min(candidates, key=lambda candidate: tried[candidate])
 
-    best = fastest([Ffmpeg(graph, outputs[0]) for graph in GRAPHS])
+    graphs = GRAPHS if suffix == ".png" else JPEG_GRAPHS
+    best = fastest([Ffmpeg(graph, outputs[0]) for graph in graphs])
     best = fastest([best, *(replace(best, output=output) for output in outputs[1:])])
     best = fastest(
         [
