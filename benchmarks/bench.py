@@ -19,6 +19,7 @@ import compute
 import encoders
 import inprocess
 import memory
+from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
 from processes import Processes
 from table import Section, summary
 from workspace import Workspace, machine_lines, storage, version_lines, workspace
@@ -28,11 +29,11 @@ from workspace import Workspace, machine_lines, storage, version_lines, workspac
 class Plan:
     """How much is measured."""
 
-    compute_rounds: int = 15
+    compute_rounds: int = 11
     run_rounds: int = 7
     run_frames: int = 60
-    process_rounds: int = 5
-    process_frames: int = 300
+    process_rounds: int = 3
+    process_frames: int = 240
     encode_rounds: int = 9
     memory_rounds: int = 2
     few: int = 200
@@ -115,29 +116,24 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
 
 
 def page_of(plan: Plan, parts: Parts, machine: list[str], minutes: float, quick: bool) -> str:
-    return (
-        "\n\n".join(
-            [
-                "# Benchmarks",
-                "Written by `make bench`, which replaces it. The targets were set before anything was measured.",
-                *(["**A smoke run (`--quick`): these figures are soft.**"] if quick else []),
-                summary(parts.sections),
-                *(section.markdown() for section in parts.sections),
-                "## Machine and versions\n\n" + "\n".join([*machine, *version_lines()]),
-                f"## Method\n\n{method(plan)} The run took {minutes:.1f} minutes.",
-                *parts.endings,
-            ]
-        )
-        + "\n"
-    )
+    blocks = [
+        "# Benchmarks",
+        "Written by `make bench`, which replaces it. The targets were set before anything was measured.",
+        *(["**A smoke run (`--quick`): these figures are soft.**"] if quick else []),
+        summary(parts.sections),
+        *(section.markdown() for section in parts.sections),
+        "## Machine and versions\n\n" + "\n".join([*machine, *version_lines()]),
+        f"## Method\n\n{method(plan)} The run took {minutes:.1f} minutes.",
+        *parts.endings,
+    ]
+    return "\n\n".join(blocks) + "\n"
 
 
 def method(plan: Plan) -> str:
-    from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
-
     rounds = (
         f"{plan.compute_rounds} rounds in memory, {plan.run_rounds} in one process,"
-        f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders, {plan.memory_rounds} of memory, {plan.help_rounds} of start-up"
+        f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders,"
+        f" {plan.memory_rounds} of memory, {plan.help_rounds} of start-up"
     )
     return METHOD.format(
         storage=storage().capitalize(),

@@ -23,12 +23,13 @@ AGREE = 1.0  # grey levels of mean difference that the other implementations may
 TEXT = """\
 Windowing (`index_counts`), warping by a homography (`Warp.apply`: turned by 1.5 degrees, slightly tilted)
 and blending into RGB, in memory, on one thread (`cv2.setNumThreads(1)`), output allocated anew for each
-frame as the pipeline does. *Part* means that thermal covers {part:.0%} of the RGB grid and the rest is kept
-by the mask (the default policy), *all* that it covers everything. *Copy* is `numpy.copyto` of the RGB
+frame as the pipeline does. *Part* means that thermal covers {part:.0%} of the RGB grid and the rest is
+kept by the mask (the default policy), *all* that it covers everything. *Copy* is `numpy.copyto` of the RGB
 frame's bytes and of the thermal frame's bytes into arrays that exist already. *Floats* is
 `cv2.warpPerspective` of the counts, then window, colour table and blend in numpy float64, rounded. *OpenCV*
 is `LUT` (16-bit: `subtract` and `convertScaleAbs`), `warpPerspective`, `applyColorMap`, `addWeighted` and a
-masked copy, no line of ours. Each was checked to give our pixels to within {agree:g} grey level on average."""
+masked copy, no line of ours. Each was checked to give our pixels to
+within {agree:g} grey level on average."""
 
 
 def registration(size_wh: tuple[int, int], scale: float) -> NDArray[np.float64]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-from content import CASES, Case
+from content import CASES, Case, pairs_of
 from numpy.typing import NDArray
 from table import Row, Section, at_least, at_most, milliseconds
 from timing import Job, clocked, interleaved
@@ -21,7 +23,8 @@ TEXT = """\
 round at 640x480 and a quarter of that at 1280x1024. *Codecs alone* reads the same files
 (`Path.read_bytes`), decodes them (`decode_image`), encodes the fused pixels, which it holds already
 (`encode_png`, `encode_jpeg`), and writes them (`Path.write_bytes`): no pairing, no kernel, no index, no
-rename."""
+rename. What two threads can bring at all on this machine is shown by `zlib.decompress`, which needs nothing
+of ours."""
 
 
 def measure(space: Workspace, distinct: int, frames: int, rounds: int) -> Section:
@@ -31,7 +34,21 @@ def measure(space: Workspace, distinct: int, frames: int, rounds: int) -> Sectio
     for case, suffix in kinds:
         count = frames if case.size_wh[0] == 640 else max(frames // 4, distinct)
         section.rows += _rows(Folders(space, case, suffix, distinct, count), rounds)
+    section.rows.append(_ceiling(rounds))
     return section
+
+
+def _ceiling(rounds: int) -> Row:
+    """What two threads of plain C bring: two cores may be the two halves of one."""
+    data = zlib.compress(pairs_of(CASES[0], 1)[0][0].tobytes(), 1)
+
+    def inflate(threads: int) -> float:
+        with ThreadPoolExecutor(threads) as pool:
+            return clocked(lambda: list(pool.map(zlib.decompress, [data] * 40)))
+
+    taken = interleaved({"one": lambda: inflate(1), "two": lambda: inflate(2)}, rounds)
+    one, two = (taken[name].per(40) for name in ("one", "two"))
+    return Row("this machine: one thread of zlib / two", milliseconds(two), milliseconds(one), one.over(two))
 
 
 class Folders:

@@ -125,7 +125,9 @@ def _channels(value: str, lo: int, hi: int) -> dict[str, str]:
     r, b = f"255*clip(2-{sixths},0,1)", f"255*clip({sixths}-2,0,1)"
     g = f"255*clip(min({sixths},4-{sixths}),0,1)"
     return {
-        **{"r": r, "g": g, "b": b},
+        "r": r,
+        "g": g,
+        "b": b,
         "y": f"(0.299*{r}+0.587*{g}+0.114*{b})",
         "u": f"(128-0.168736*{r}-0.331264*{g}+0.5*{b})",
         "v": f"(128+0.5*{r}-0.418688*{g}-0.081312*{b})",
@@ -190,7 +192,7 @@ BLENDS = {
 
 @dataclass(frozen=True, slots=True)
 class Magick:
-    """One way of using ImageMagick: a process for each frame, or two processes with half of the frames each."""
+    """ImageMagick: a process for each frame, or two processes with half of the frames each."""
 
     process_per_frame: bool
     blend: str

@@ -52,7 +52,7 @@ def workspace() -> Iterator[Workspace]:
 def storage() -> str:
     if os.access(MEMORY_BACKED, os.W_OK):
         return "files in memory-backed storage (tmpfs)"
-    return "files in the system's temporary folder (**no memory-backed storage: the disk is part of the figures**)"
+    return "files in the system's temporary folder (**not in memory: the disk is part of the figures**)"
 
 
 def blend_command(

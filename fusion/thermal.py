@@ -346,7 +346,7 @@ def _better_option(rule: WindowRule) -> str:
     if rule.unit != "percentile":
         return "try --preset auto, or a wider --window"
     if rule.hi - rule.lo < 100 * (1 - _ADVISE_ABOVE):
-        return "try wider percentiles, such as --window 1 99"
+        return "try wider percentiles, such as --window 1 99 --window-unit percentile"
     if rule.over == "sequence":
         return "the scene changes along the sequence, try --window-over running"
     return "try a wider --window, or --window-over frame, which may flicker"

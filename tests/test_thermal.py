@@ -1,0 +1,209 @@
+"""Windows against numpy, and against what METHOD section 1 and MATLAB's imadjust say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from fusion.errors import FrameError, InputError, UsageError
+from fusion.frames import Window
+from fusion.kernels import index_counts
+from fusion.thermal import AUTO, THESIS, WindowRule, clip_advice, equalise, plan_windows
+
+Read = Callable[[int], NDArray[np.uint16]]
+
+
+def noise(i: int, *, level: int = 7000, size: tuple[int, int] = (40, 50)) -> NDArray[np.uint16]:
+    return np.random.default_rng(i).normal(level, 30, size).astype(np.uint16)
+
+
+def every_value(dtype: type[np.uint8] | type[np.uint16]) -> NDArray[Any]:
+    side = 16 if dtype is np.uint8 else 256
+    return np.arange(side * side, dtype=np.uint32).astype(dtype).reshape(side, side)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_thesis_window_is_imadjust_on_every_value(dtype: type[np.uint8] | type[np.uint16]) -> None:
+    counts = every_value(dtype)
+    window = plan_windows(THESIS, 1, lambda _: counts).window(0, counts)
+    top = int(np.iinfo(dtype).max)
+    stretched = np.clip((counts / top - 0.3) / (0.6 - 0.3), 0, 1)  # imadjust on [0, 1]
+    exact = 255 * stretched
+    index, below, above = index_counts(counts, window.lo, window.hi)
+    assert np.abs(index - exact).max() <= 0.5 + 1e-9
+    assert (below, above) == ((counts < 0.3 * top).sum(), (counts > 0.6 * top).sum())
+
+
+@given(
+    arrays(np.uint16, st.tuples(st.integers(1, 9), st.integers(1, 9))),
+    st.floats(0, 99).flatmap(lambda lo: st.tuples(st.just(lo), st.floats(lo, 100))),
+)
+def test_frame_percentiles_are_numpys(counts: NDArray[np.uint16], limits: tuple[float, float]) -> None:
+    lo, hi = limits
+    if lo >= hi:
+        return
+    window = plan_windows(WindowRule(lo, hi, "percentile", "frame"), 1, lambda _: counts).window(0, counts)
+    expected = np.percentile(counts.astype(np.float64), [lo, hi])
+    if expected[1] - expected[0] < 1e-3:
+        middle = expected.mean()
+        assert (window.lo, window.hi) == pytest.approx((middle - 0.5, middle + 0.5))
+    else:
+        assert (window.lo, window.hi) == pytest.approx(tuple(expected), rel=1e-12, abs=1e-6)
+
+
+def test_auto_pools_32_frames_spread_over_the_sequence() -> None:
+    asked: list[int] = []
+
+    def read(i: int) -> NDArray[np.uint16]:
+        asked.append(i)
+        return noise(i, level=7000 + i)
+
+    plan = plan_windows(AUTO, 320, read)
+    assert asked == list(range(5, 320, 10))
+    pooled = np.percentile(np.concatenate([noise(i, level=7000 + i).ravel() for i in asked]), [1, 99])
+    window = plan.window(17, noise(17))
+    assert (window.lo, window.hi) == pytest.approx(tuple(pooled), rel=1e-12)
+    assert plan.window(300, noise(3)) == window
+    assert plan.record()["sample_frames"] == asked
+
+
+@pytest.mark.parametrize("count", [1, 5, 32])
+def test_auto_reads_all_of_a_short_sequence(count: int) -> None:
+    asked: list[int] = []
+    plan_windows(AUTO, count, lambda i: asked.append(i) or noise(i))
+    assert asked == list(range(count))
+
+
+def test_fixed_windows_read_nothing() -> None:
+    def read(i: int) -> NDArray[np.uint16]:
+        raise AssertionError(i)
+
+    assert plan_windows(WindowRule(7000, 7400, "counts"), 9, read).window(3, noise(3)) == Window(7000, 7400)
+    rule = WindowRule(20, 36, "celsius", celsius_per_count=0.04, celsius_at_zero=-273.15)
+    window = plan_windows(rule, 9, read).window(3, noise(3))
+    assert (window.lo, window.hi) == pytest.approx((293.15 / 0.04, 309.15 / 0.04))
+
+
+def test_unreadable_samples_are_passed_over_and_named() -> None:
+    def read(i: int) -> NDArray[np.uint16]:
+        if i % 2:
+            raise FrameError("half a file", where=f"fir/{i}.png")
+        return noise(i)
+
+    plan = plan_windows(AUTO, 6, read)
+    assert plan.skipped == ("fir/1.png: half a file", "fir/3.png: half a file", "fir/5.png: half a file")
+    assert plan.window(1, noise(1)) == plan_windows(AUTO, 3, lambda i: noise(2 * i)).window(0, noise(0))
+    with pytest.raises(InputError, match="none of the 2"):
+        plan_windows(AUTO, 2, lambda i: read(2 * i + 1))
+
+
+def test_types_are_not_mixed() -> None:
+    with pytest.raises(InputError, match=r"uint16.*uint8"):
+        plan_windows(AUTO, 2, lambda i: noise(i) if i == 0 else every_value(np.uint8))
+    plan = plan_windows(AUTO, 2, noise)
+    with pytest.raises(FrameError, match="uint8"):
+        plan.window(1, every_value(np.uint8))
+
+
+def blinking(i: int) -> NDArray[np.uint16]:
+    """A steady scene in which a hot plate goes on and off from one frame to the next."""
+    counts = noise(0).copy()
+    counts[:10] = 8000 if i % 2 else counts[:10]
+    return counts
+
+
+def largest_step(rule: WindowRule, read: Read, count: int = 101) -> float:
+    plan = plan_windows(rule, count, read)
+    limits = [plan.window(i, read(i)).hi for i in range(count)]
+    return float(np.abs(np.diff(limits)).max())
+
+
+def test_a_running_window_does_not_flicker() -> None:
+    """Key values alternate by 1000 counts: smoothed, all are in the middle but the ends, 250 away, 10 frames on."""
+
+    def irregular(i: int) -> NDArray[np.uint16]:
+        return blinking(i // 10 if i % 10 == 0 else i)  # key frames, too, are now hot and now not
+
+    spread = 1000
+    assert largest_step(WindowRule(1, 99, "percentile", "frame"), irregular) > 0.9 * spread
+    assert 0 < largest_step(WindowRule(1, 99, "percentile", "running"), irregular) <= 0.03 * spread
+    assert largest_step(WindowRule(1, 99, "percentile", "sequence"), irregular) == 0
+
+
+def test_a_running_window_follows_a_drift_and_rests_on_a_constant() -> None:
+    drift = plan_windows(
+        WindowRule(1, 99, "percentile", "running"), 201, lambda i: noise(0, level=7000 + 5 * i)
+    )
+    assert drift.window(100, noise(0)).lo - drift.window(50, noise(0)).lo == pytest.approx(250, abs=1)
+    steady = plan_windows(running, 47, lambda _: noise(0))
+    windows = {steady.window(i, noise(0)) for i in range(47)}
+    assert len(windows) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 10, 11, 14, 15, 16, 31])
+def test_a_running_window_is_the_same_in_any_order(count: int) -> None:
+    rule = WindowRule(2, 98, "percentile", "running")
+    plan = plan_windows(rule, count, lambda i: noise(i, level=7000 + 20 * i))
+    forward = [plan.window(i, noise(i)) for i in range(count)]
+    assert [plan.window(i, noise(i)) for i in reversed(range(count))] == forward[::-1]
+    assert all(window.lo < window.hi for window in forward)
+
+
+@pytest.mark.parametrize(
+    ("limits", "named"),
+    [
+        ((0.6, 0.3), "--window"),
+        ((0.3, 0.3), "--window"),
+        ((-0.1, 0.5), "--window"),
+        ((0.3, 1.2), "--window"),
+        ((float("nan"), 0.5), "--window"),
+        ((0, float("inf"), "counts"), "--window"),
+        ((70000, 80000, "counts"), "16-bit"),
+        ((5, 101, "percentile"), "--window"),
+        ((20, 30, "celsius"), "--celsius-per-count"),
+        ((0.1, 0.2, "kelvin"), "--window-unit"),
+        ((0.1, 0.2, "fraction", "frame"), "--window-over"),
+        ((-300, 20, "celsius", "sequence", 0.04, -273.15), "-273.15"),
+        ((20, 30, "celsius", "sequence", 0.0, -273.15), "--celsius-per-count"),
+    ],
+)
+def test_windows_that_cannot_be_meant_name_the_option(limits: tuple[float, ...], named: str) -> None:
+    with pytest.raises(UsageError) as refusal:
+        WindowRule(*limits)  # type: ignore[arg-type]
+    assert named in str(refusal.value)
+
+
+def test_a_window_outside_the_type_is_the_frames_fault() -> None:
+    plan = plan_windows(WindowRule(7000, 7400, "counts"), 1, noise)
+    with pytest.raises(FrameError, match="uint8"):
+        plan.window(0, every_value(np.uint8))
+
+
+def test_clahe_raises_local_contrast_and_leaves_its_input_alone() -> None:
+    rng = np.random.default_rng(0)
+    dim = np.hstack([rng.integers(40, 60, (64, 64)), rng.integers(180, 200, (64, 64))]).astype(np.uint8)
+    before = dim.copy()
+    equal = equalise(dim, 4.0)
+    assert np.array_equal(dim, before)
+    assert equal[:, :48].std() > 1.5 * dim[:, :48].std()
+    assert np.array_equal(equal, equalise(dim, 4.0))
+    with pytest.raises(UsageError, match="--clahe"):
+        equalise(dim, 0)
+
+
+def test_advice_comes_above_a_third_and_names_a_better_option() -> None:
+    assert clip_advice(0.2, 0.13, THESIS) is None
+    advice = clip_advice(0.9, 0.05, THESIS)
+    assert advice is not None
+    assert "95%" in advice
+    assert "--preset auto" in advice
+    narrow = clip_advice(0.3, 0.3, WindowRule(30, 70, "percentile"))
+    assert narrow is not None
+    assert "--window 1 99 --window-unit percentile" in narrow
