@@ -126,7 +126,7 @@ def largest_step(rule: WindowRule, read: Read, count: int = 101) -> float:
 
 
 def test_a_running_window_does_not_flicker() -> None:
-    """Key values alternate by 1000 counts: smoothed, all are in the middle but the ends, 250 away, 10 frames on."""
+    """Key values alternate by 1000 counts; smoothed, all but the ends, 250 away, come to lie in the middle."""
 
     def irregular(i: int) -> NDArray[np.uint16]:
         return blinking(i // 10 if i % 10 == 0 else i)  # key frames, too, are now hot and now not
@@ -138,9 +138,8 @@ def test_a_running_window_does_not_flicker() -> None:
 
 
 def test_a_running_window_follows_a_drift_and_rests_on_a_constant() -> None:
-    drift = plan_windows(
-        WindowRule(1, 99, "percentile", "running"), 201, lambda i: noise(0, level=7000 + 5 * i)
-    )
+    running = WindowRule(1, 99, "percentile", "running")
+    drift = plan_windows(running, 201, lambda i: noise(0, level=7000 + 5 * i))
     assert drift.window(100, noise(0)).lo - drift.window(50, noise(0)).lo == pytest.approx(250, abs=1)
     steady = plan_windows(running, 47, lambda _: noise(0))
     windows = {steady.window(i, noise(0)) for i in range(47)}
