@@ -18,6 +18,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from fusion.errors import FrameError
+from fusion.png import decode_plain
 
 try:
     import fpng
@@ -137,6 +138,9 @@ def _decode_png(data: bytes, where: str, max_pixels: int) -> Pixels:
     if kind != b"IHDR" or length != 13:
         raise _corrupt(where, "the PNG header is damaged")
     _check_size(width, height, where, max_pixels)
+    plain = decode_plain(data, max_pixels)
+    if plain is not None:
+        return plain
     if not data.endswith(_PNG_END) and _PNG_END not in data:
         raise _truncated(where)
     return _by_opencv(_without_png_metadata(data, where), where)

@@ -104,7 +104,7 @@ def resample(
     out = _writable(out, offset.shape, image, offset, fraction)
     taps = scratch("kernels.taps", image.shape, np.uint32)
     pairs = scratch("kernels.pairs", image.shape[1:], np.uint16)
-    if not _sample(_read_only(image), _flat(offset), _flat(fraction), taps, pairs, out.reshape(-1)):
+    if not _sample(read_only(image), _flat(offset), _flat(fraction), taps, pairs, out.reshape(-1)):
         raise ValueError(f"an offset lies outside the image of {image.size} pixels: {offset.max()}")
     return out
 
@@ -173,7 +173,8 @@ def _writable(out: NDArray[np.uint8], shape: tuple[int, ...], *inputs: NDArray[A
     return out
 
 
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A view that may not be written, so that a loop is compiled for one kind of array only."""
     view = array.view(np.ndarray)
     view.flags.writeable = False
     return view
@@ -181,7 +182,7 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 def _flat(array: NDArray[Any]) -> NDArray[Any]:
     """A flat read-only view, so that each loop is compiled for one kind of array only."""
-    return _read_only(array.reshape(-1))
+    return read_only(array.reshape(-1))
 
 
 class _NoAlias(CompilerBase):
@@ -212,7 +213,8 @@ class _MachineCode(FunctionCache):
             super().save_overload(sig, data)
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Machine code of a loop over arrays that do not overlap: its callers promise that."""
     loop: Any = numba.njit(function, nogil=True, pipeline_class=_NoAlias)
     with suppress(RuntimeError):  # nowhere to keep machine code: every process compiles for itself
         loop._cache = _MachineCode(function)  # what `cache=True` does, with our store
@@ -224,7 +226,7 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 # otherwise test for Python's negative indices, which stops vectorising.
 
 
-@_compiled
+@compiled
 def _look_up_counts(counts, first, table, index):
     below = above = 0
     for start in range(0, counts.size, _COUNTED):
@@ -235,7 +237,7 @@ def _look_up_counts(counts, first, table, index):
     return below, above
 
 
-@_compiled
+@compiled
 def _look_up_block(counts, first, table, index):
     last = _i32(first + _i32(table.size) - 1)
     tally = _u32(0)
@@ -246,7 +248,7 @@ def _look_up_block(counts, first, table, index):
     return tally
 
 
-@_compiled
+@compiled
 def _sample(image, offset, fraction, taps, pairs, out):
     h, w = image.shape
     flat_taps = taps.reshape(-1)
@@ -264,7 +266,7 @@ def _sample(image, offset, fraction, taps, pairs, out):
     return True
 
 
-@_compiled
+@compiled
 def _largest(values):
     largest = _u32(0)
     for i in range(values.size):
@@ -272,13 +274,13 @@ def _largest(values):
     return largest
 
 
-@_compiled
+@compiled
 def _pair_rows(upper, lower, pairs):
     for x in range(pairs.size):
         pairs[x] = _u16(_u16(upper[x]) | _u16(_u16(lower[x]) << _u16(8)))
 
 
-@_compiled
+@compiled
 def _pair_columns(pairs, taps):
     """The four taps of a pixel in one word: upper left, lower left, upper right, lower right."""
     last = pairs.size - 1
@@ -287,7 +289,7 @@ def _pair_columns(pairs, taps):
     taps[last] = _u32(_u32(pairs[last]) | _u32(_u32(pairs[last]) << _u32(16)))
 
 
-@_compiled
+@compiled
 def _interpolate(taps, offset, fraction, out):
     for i in range(out.size):
         four = taps[_u32(offset[i] & _u32(0x7FFFFFFF))]  # known to fit 31 bits: the faster gather
@@ -300,7 +302,7 @@ def _interpolate(taps, offset, fraction, out):
         out[i] = _u8(_u32(value + _u32(32768)) >> _u32(16))
 
 
-@_compiled
+@compiled
 def _blend(bgr, index, words, mask, keep, high, middle, low, colours, kept, out):
     colour_bytes, kept_bytes = colours.view(np.uint8), kept.view(np.uint8)
     for start in range(0, index.size, _BLENDED):
@@ -313,7 +315,7 @@ def _blend(bgr, index, words, mask, keep, high, middle, low, colours, kept, out)
         _mix(rgb, colour_bytes, high, middle, low, out[3 * start : 3 * stop])
 
 
-@_compiled
+@compiled
 def _spread(index, words, out):
     """The low three bytes of words[index], one after the other (little-endian, as all our platforms)."""
     last = index.size - 1
@@ -331,7 +333,7 @@ def _spread(index, words, out):
         out[3 * i + 2] = _u32(c >> _u32(16))
 
 
-@_compiled
+@compiled
 def _holes(mask):
     holes = False
     for i in range(mask.size):
@@ -339,14 +341,14 @@ def _holes(mask):
     return holes
 
 
-@_compiled
+@compiled
 def _replace(colour, kept, rgb):
     """RGB in place of colour where thermal was not seen: blended with itself it stays as it is."""
     for i in range(rgb.size):
         colour[i] = _u8(_u8(colour[i] & kept[i]) | _u8(rgb[i] & _u8(~kept[i])))
 
 
-@_compiled
+@compiled
 def _mix(rgb, colour, high, middle, low, out):
     """floor(alpha rgb + (1 - alpha) colour + 1/2) in 16-bit integers.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from fusion.pipeline import Fuser
 
-LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "simplejpeg", "fpng")
+LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "simplejpeg", "fpng", "isal")
 
 
 def describe_run(fuser: Fuser) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def _versions() -> dict[str, str]:
 def _version(name: str) -> str:
     try:
         return version(name)
-    except PackageNotFoundError:  # fpng has a stand-in; the files' bytes, not their pixels, differ
+    except PackageNotFoundError:  # fpng and isal have stand-ins; the files' bytes, not their pixels, differ
         return "none"
 
 

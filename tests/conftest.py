@@ -6,6 +6,10 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("fusion", deadline=None)  # speed is a benchmark, never a timed test
+settings.load_profile("fusion")
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ import fusion
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors", "frames"},
-    {"files", "tables", "codecs", "kernels"},
+    {"files", "tables", "codecs", "png", "unfilter", "kernels"},
     {
         "sources",
         "pairing",
@@ -34,6 +34,9 @@ FLOORS = [
 ]
 FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 SAME_FLOOR = {
+    ("codecs", "png"),
+    ("png", "unfilter"),
+    ("unfilter", "kernels"),
     ("registration", "homography"),
     ("registration", "warp"),
     ("manifest", "pairing"),

@@ -360,7 +360,7 @@ def test_a_second_process_finds_the_machine_code() -> None:
 def test_without_a_place_for_machine_code_a_loop_still_compiles() -> None:
     namespace: dict[str, Any] = {}
     exec("def twice(n):\n    return n + n", namespace)  # from no file: there is nothing to cache beside
-    assert kernels._compiled(namespace["twice"])(21) == 42
+    assert kernels.compiled(namespace["twice"])(21) == 42
 
 
 def test_damaged_or_unwritable_machine_code_is_compiled_again(
@@ -374,7 +374,7 @@ def test_damaged_or_unwritable_machine_code_is_compiled_again(
 
     def found(n: int) -> bool:
         """Whether a fresh process's first call would find machine code; the call itself must be right."""
-        loop: Any = kernels._compiled(twice)
+        loop: Any = kernels.compiled(twice)
         assert loop(n) == 2 * n
         return bool(loop.stats.cache_hits)
 
@@ -383,7 +383,7 @@ def test_damaged_or_unwritable_machine_code_is_compiled_again(
         for path in list((tmp_path / "code").rglob(pattern)):
             path.write_bytes(b"")
         assert [found(3), found(4)] == [False, True]  # and it was mended
-    loop: Any = kernels._compiled(twice)
+    loop: Any = kernels.compiled(twice)
     shutil.rmtree(tmp_path / "code")
     (tmp_path / "code").write_text("a file where the folder was")
     assert loop(5) == 10
