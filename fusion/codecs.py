@@ -83,7 +83,9 @@ def encode_png(pixels: Pixels) -> bytes:
     if fpng is not None and pixels.ndim == 3 and pixels.dtype == np.uint8:
         order = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
         return fpng.from_ndarray(cv2.cvtColor(pixels, order))
-    done, data = cv2.imencode(".png", pixels, _PNG_FAST)
+    # one channel of 8 bits is a mask here: OpenCV's own choice of filter is far smaller and faster on those
+    options = () if pixels.ndim == 2 and pixels.dtype == np.uint8 else _PNG_FAST
+    done, data = cv2.imencode(".png", pixels, options)
     if not done:
         raise ValueError(f"cannot encode {pixels.shape} {pixels.dtype} as PNG")
     return data.tobytes()

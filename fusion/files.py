@@ -20,13 +20,23 @@ def replace_file(path: Path, data: bytes, temporary: Path | None = None) -> None
     """
     temporary = temporary or path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(data)
-        temporary.replace(path)
+        try:
+            _write(temporary, data)
+            os.replace(temporary, path)  # noqa: PTH105 - Path.replace costs half as much again
+        except FileNotFoundError:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write(temporary, data)
+            os.replace(temporary, path)  # noqa: PTH105
     except OSError as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise output_error(error, path) from None
+
+
+def _write(path: Path, data: bytes) -> None:
+    with open(path, "wb", buffering=0) as file:  # noqa: PTH123
+        if file.write(data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def output_error(error: OSError, path: Path) -> OutputError:

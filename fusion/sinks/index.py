@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 
 from fusion.errors import FrameError
@@ -62,6 +63,7 @@ class Row:
 
 
 COLUMNS = tuple(field.name for field in fields(Row))
+_cells = attrgetter(*COLUMNS)  # `astuple` would copy every value deeply
 
 
 def to_csv(rows: Iterable[Row], header: bool = True) -> str:
@@ -69,7 +71,7 @@ def to_csv(rows: Iterable[Row], header: bool = True) -> str:
     writer = csv.writer(text, lineterminator="\n")
     if header:
         writer.writerow(COLUMNS)
-    writer.writerows(astuple(row) for row in rows)
+    writer.writerows(map(_cells, rows))
     return text.getvalue()
 
 
