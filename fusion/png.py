@@ -9,16 +9,16 @@ Network Graphics (PNG) Specification, 2nd edition: chunks in section 5, filters 
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-try:
+isal_zlib: Any = None
+with suppress(ImportError):  # no wheel for this platform: OpenCV decodes them all
     from isal import isal_zlib
-except ImportError:  # no wheel for this platform: OpenCV decodes them all
-    isal_zlib = None
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _SAMPLES = {0: 1, 2: 3}  # colour type -> samples a pixel

@@ -77,7 +77,9 @@ def test_libpng_agrees(kind: int, shape: tuple[int, ...], dtype: type[np.uint8])
     data = written((smooth % (int(np.iinfo(dtype).max) + 1)).astype(dtype), [kind])
     decoded = decode_plain(data, LIMIT)
     assert decoded is not None
-    assert np.array_equal(decoded, cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+    theirs = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert theirs is not None
+    assert np.array_equal(decoded, theirs)
 
 
 PLAIN = written(np.arange(63, dtype=np.uint8).reshape(7, 9), [4, 1])
