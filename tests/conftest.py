@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("fusion", deadline=None)  # speed is a benchmark, never a timed test
+# Speed is a benchmark, never a timed test. In CI the same examples every time; by hand new ones.
+settings.register_profile("fusion", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("fusion")
 
 
