@@ -7,8 +7,9 @@ import io
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from fusion.provenance import describe_run
 from fusion.report.sheet import contact_sheet
 from fusion.report.text import closing_lines, plan_lines, warnings_of
 from fusion.sinks.folder import FolderSink
+from fusion.sources.folders import split_pattern
 from fusion.sync import Pairs, open_pairs
 
 PREVIEW = "preview.png"
@@ -87,19 +89,19 @@ def run_blend(
         raise UsageError(f"{workers} is no number of threads", where="--workers", hint=f"1 to {MAX_WORKERS}")
     if out is not None:
         refuse_overlap(inputs, out)
-    pairs = open_inputs(settings, inputs, dataset)
-    try:
+    with quiet_libraries(), closing(open_inputs(settings, inputs, dataset)) as pairs:
         report_pairing(pairs, settings.strict, show=dry_run)
         if out is None or (dry_run and not preview):
             return
         fuser = Fuser(pairs, settings)
+        warn(fuser.registration.notes)
         if dry_run:
             replace_file(out / PREVIEW, _preview_png(fuser))
             print(f"preview: {out / PREVIEW}")
             return
         if not quiet:
             print("\n".join(plan_lines(fuser)), flush=True)
-        with quiet_libraries(), _sink(fuser, out, overwrite) as sink:
+        with _sink(fuser, out, overwrite) as sink:
             if preview:
                 sink.write_file(PREVIEW, _preview_png(fuser))
             with progress_bar(quiet) as progress:
@@ -108,10 +110,12 @@ def run_blend(
                 sink.write_file("unmatched.csv", unmatched_csv(pairs))
         if not quiet:
             print("\n".join(closing_lines(fuser, report, out)))
-        for warning in warnings_of(fuser, report):
-            print(f"fusion: warning: {warning}", file=sys.stderr)
-    finally:
-        pairs.close()
+        warn(warnings_of(fuser, report))
+
+
+def warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        print(f"fusion: warning: {warning}", file=sys.stderr)
 
 
 def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | None) -> Pairs:
@@ -168,13 +172,7 @@ def fixed_folder(spec: str) -> Path | None:
     path = Path(spec)
     if path.is_dir():
         return path.resolve()
-    if path.exists():
-        return None
-    fixed = list(path.parts)
-    for depth, part in enumerate(fixed):
-        if any(mark in part for mark in "*?["):
-            return Path(*fixed[:depth]).resolve()
-    return None
+    return None if path.exists() or not has_magic(spec) else split_pattern(spec)[0].resolve()
 
 
 @contextmanager

@@ -54,8 +54,7 @@ def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
 
 def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
     """What the user should act on, a line each."""
-    warnings = list(fuser.registration.notes)
-    warnings += [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
+    warnings = [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
     if len(report.skipped) > LOUD_SKIPS:
         warnings.append(f"… and {len(report.skipped) - LOUD_SKIPS} more, all named in frames.csv")
     if fuser.pairs.pairing.unmatched:

@@ -200,6 +200,25 @@ def test_an_image_that_claims_to_be_huge_takes_no_memory(fusion: Fusion, tmp_pat
     one_line(fusion("blend", rgb, fir, "-o", tmp_path / "out2", "--strict"), "f000.png")
 
 
+def test_damaged_files_are_reported_by_us_alone(tmp_path: Path) -> None:
+    """libpng and libtiff would write lines of their own to the terminal."""
+    rgb, fir = write_pairs(tmp_path, 4)
+    for folder, name in ((rgb, "f000.png"), (fir, "f002.png")):
+        data = bytearray((folder / name).read_bytes())
+        data[len(data) // 2] ^= 255
+        (folder / name).write_bytes(data)
+    command = [sys.executable, "-m", "fusion", "blend", str(rgb), str(fir), "-o", str(tmp_path / "out")]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert all(line.startswith("fusion: warning: ") for line in lines), done.stderr
+    assert [name for name in ("f000", "f002") if any(f"skipped {name}" in line for line in lines)] == [
+        "f000",
+        "f002",
+    ]
+
+
 def test_output_inside_the_input(fusion: Fusion, tmp_path: Path) -> None:
     rgb, fir = write_pairs(tmp_path, 2)
     before = tree(tmp_path)
