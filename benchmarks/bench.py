@@ -33,7 +33,7 @@ class Plan:
     run_rounds: int = 7
     run_frames: int = 60
     process_rounds: int = 3
-    process_frames: int = 240
+    process_frames: int = 480
     encode_rounds: int = 9
     memory_rounds: int = 2
     few: int = 200
