@@ -1,9 +1,9 @@
 """Runs a whole sequence through a `Fuser` into a sink: in order, resumable, with several threads.
 
 The work is decoding, a few kernels and encoding. All but fpng release the interpreter lock while they
-work, so threads scale until its share, about a fifth of a PNG frame, is all that is left. OpenCV's own pool is
-held to one thread meanwhile, because pools that fight cost more than they give. At most a few frames are
-in flight, so memory does not grow with the sequence.
+work, so threads scale until its share, about a fifth of a PNG frame, is all that is left. OpenCV's own pool
+is held to one thread meanwhile, because pools that fight cost more than they give. At most a few frames
+are in flight, so memory does not grow with the sequence.
 """
 
 from __future__ import annotations
