@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import tomlkit
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -15,7 +20,7 @@ from numpy.typing import NDArray
 from fusion.errors import FrameError, InputError, UsageError
 from fusion.frames import Window
 from fusion.kernels import index_counts
-from fusion.thermal import AUTO, THESIS, WindowRule, clip_advice, equalise, plan_windows
+from fusion.thermal import AUTO, THESIS, Unit, WindowRule, clip_advice, equalise, plan_windows
 
 Read = Callable[[int], NDArray[np.uint16]]
 
@@ -207,3 +212,148 @@ def test_advice_comes_above_a_third_and_names_a_better_option() -> None:
     narrow = clip_advice(0.3, 0.3, WindowRule(30, 70, "percentile"))
     assert narrow is not None
     assert "--window 1 99 --window-unit percentile" in narrow
+
+
+def level_change(i: int) -> NDArray[np.uint16]:
+    """Flat frames, 7000 counts before frame 40 and 8000 from there on."""
+    return np.full((2, 2), 7000 if i < 40 else 8000, np.uint16)
+
+
+def key_twin(count: int, read: Read, i: int) -> tuple[float, float]:
+    """A running 1..99 window in numpy alone: keys, smoothing as a convolution, linear in between."""
+    keys = [k for k in range(0, count, 10) if k == 0 or count - 1 - k >= 5 or k == count - 1]
+    keys = keys if keys[-1] == count - 1 else [*keys, count - 1]
+    limits = np.array([np.percentile(read(k), [1, 99]) for k in keys])
+    smooth = [np.convolve(np.pad(side, 1, "edge"), [0.25, 0.5, 0.25], "valid") for side in limits.T]
+    return float(np.interp(i, keys, smooth[0])), float(np.interp(i, keys, smooth[1]))
+
+
+@pytest.mark.parametrize("count", [1, 3, 6, 11, 14, 16, 41, 58])
+def test_a_running_window_is_its_numpy_twin(count: int) -> None:
+    def read(i: int) -> NDArray[np.uint16]:
+        return noise(i, level=7000 + i * i)
+
+    plan = plan_windows(WindowRule(1, 99, "percentile", "running"), count, read)
+    for i in range(count):
+        window = plan.window(i, noise(0))
+        assert (window.lo, window.hi) == pytest.approx(key_twin(count, read, i), rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [42, 43, 44, 45, 46, 51])
+def test_a_jump_near_the_end_moves_a_running_window_by_a_tenth_at_most(count: int) -> None:
+    """Half the spread between two smoothed keys, and keys at least five frames apart: 1000 / 2 / 5."""
+    assert 0 < largest_step(WindowRule(1, 99, "percentile", "running"), level_change, count) <= 100 + 1e-9
+
+
+def test_unreadable_key_frames_leave_their_neighbours_in_charge() -> None:
+    def read(i: int) -> NDArray[np.uint16]:
+        if i in (0, 20, 40):
+            raise FrameError("half a file", where=f"fir/{i}.png")
+        return noise(i, level=7000 + 10 * i)
+
+    plan = plan_windows(WindowRule(1, 99, "percentile", "running"), 41, read)
+    assert plan.keys == plan.samples == (10, 30)
+    assert plan.window(0, noise(0)) == plan.window(10, noise(0))
+    assert plan.window(40, noise(0)) == plan.window(30, noise(0))
+    assert plan.window(10, noise(0)).lo < plan.window(20, noise(0)).lo < plan.window(30, noise(0)).lo
+    assert len(plan.skipped) == 3
+
+
+def test_a_flat_sequence_gets_one_count_around_its_value() -> None:
+    flat = np.full((4, 4), 7000, np.uint16)
+    for over in ("frame", "sequence", "running"):
+        plan = plan_windows(WindowRule(1, 99, "percentile", over), 3, lambda _: flat)
+        assert plan.window(1, flat) == Window(6999.5, 7000.5)
+
+
+def test_pixels_that_are_no_counts_are_passed_over_by_planning_and_refused_by_the_frame() -> None:
+    wrong = [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32), np.zeros((0, 4), np.uint8)]
+    plan = plan_windows(AUTO, 4, lambda i: wrong[i] if i < 3 else noise(i))  # type: ignore[arg-type]
+    assert plan.samples == (3,)
+    assert len(plan.skipped) == 3
+    for pixels in wrong:
+        with pytest.raises(FrameError, match="frame 7: expected HxW uint8 or uint16"):
+            plan_windows(THESIS, 9, noise).window(7, pixels)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("rule", [THESIS, AUTO, WindowRule(1, 99, "percentile", "frame")])
+def test_no_frames_is_an_input_error(rule: WindowRule) -> None:
+    with pytest.raises(InputError, match="no thermal frames"):
+        plan_windows(rule, 0, noise)
+
+
+@pytest.mark.parametrize(
+    ("lo", "hi", "unit", "said"),
+    [
+        (0.3, 0.3 + 1e-15, "fraction", "too narrow"),  # the same number once scaled to counts
+        (7000, 7000 + 1e-9, "counts", "too narrow"),
+        (-1e308, 1e308, "counts", "out of reach"),  # its width is infinite
+        (-9, 0, "counts", "out of reach"),
+    ],
+)
+def test_windows_that_break_arithmetic_are_refused(lo: float, hi: float, unit: Unit, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        WindowRule(lo, hi, unit)
+
+
+def test_the_record_repeats_the_plan_and_survives_toml() -> None:
+    running = WindowRule(2, 98, "percentile", "running")
+    celsius = WindowRule(20, 36, "celsius", celsius_per_count=0.04, celsius_at_zero=-273.15)
+    for rule in (THESIS, AUTO, running, celsius):
+        plan = plan_windows(rule, 25, lambda i: noise(i, level=7000 + 9 * i))
+        record = plan.record()
+        assert tomllib.loads(tomlkit.dumps(record)) == record
+        stated = {name: record[name] for name in WindowRule.__dataclass_fields__ if name in record}
+        assert WindowRule(**stated) == rule  # type: ignore[arg-type]
+    record = plan_windows(running, 25, lambda i: noise(i, level=7000 + 9 * i)).record()
+    assert record["key_frames"] == record["sample_frames"] == [0, 10, 24]
+    assert record["dtype"] == "uint16"
+    plan = plan_windows(running, 25, lambda i: noise(i, level=7000 + 9 * i))
+    for name, side in (("key_lo_counts", "lo"), ("key_hi_counts", "hi")):
+        assert record[name] == [getattr(plan.window(i, noise(0)), side) for i in (0, 10, 24)]
+
+
+def test_clahe_works_in_tiles_and_refuses_absurd_ones() -> None:
+    ramp = np.tile(np.arange(128, dtype=np.uint8), (128, 1))
+    assert not np.array_equal(equalise(ramp, 4.0, tiles=1), equalise(ramp, 4.0, tiles=8))
+    assert equalise(np.zeros((1, 3), np.uint8), 2.0).shape == (1, 3)
+    for limit, tiles in ((float("nan"), 8), (-1.0, 8), (2.0, 0), (2.0, 65)):
+        with pytest.raises(UsageError, match="--clahe"):
+            equalise(ramp, limit, tiles)
+
+
+def test_clahe_from_several_threads_is_clahe() -> None:
+    images = [np.random.default_rng(i).integers(0, 256, (60, 80), dtype=np.uint8) for i in range(24)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda image: equalise(image, 3.0), images))
+    assert all(np.array_equal(a, equalise(b, 3.0)) for a, b in zip(together, images, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("rule", "option"),
+    [
+        (WindowRule(7000, 7010, "counts"), "--preset auto"),
+        (AUTO, "--window-over running"),
+        (WindowRule(1, 99, "percentile", "running"), "--window-over frame"),
+    ],
+)
+def test_advice_never_names_what_is_already_in_use(rule: WindowRule, option: str) -> None:
+    assert clip_advice(1 / 3, 0.0, rule) is None
+    advice = clip_advice(0.2, 0.14, rule)
+    assert advice is not None
+    assert option in advice
+    assert (rule.unit == "percentile") != ("--preset auto" in advice)
+
+
+def test_presets_on_real_pairs(shared_data: Path) -> None:
+    """METHOD section 1's remark: the thesis's constants clip most of MSRS, the default next to none."""
+    files = sorted((shared_data / "rgbt_pairs" / "MSRS" / "ir").glob("*.png"))
+    assert files
+    frames = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    for rule, least, most in ((THESIS, 0.5, 1.0), (AUTO, 0.0, 0.05)):
+        plan = plan_windows(rule, len(frames), lambda i: frames[i])  # type: ignore[arg-type, return-value]
+        for i, counts in enumerate(frames):
+            assert counts is not None
+            window = plan.window(i, counts)  # type: ignore[arg-type]
+            clipped = float(((counts < window.lo) | (counts > window.hi)).mean())
+            assert least <= clipped <= most

@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from glob import has_magic
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ from typing import Any
 from fusion.batch import no_progress, opencv_on_one_thread, run
 from fusion.codecs import encode_png
 from fusion.config import BlendConfig, load_config
-from fusion.errors import InputError, OutputError, UsageError
+from fusion.errors import FrameError, InputError, OutputError, UsageError
 from fusion.files import replace_file
-from fusion.manifest import load_manifest
+from fusion.manifest import Manifest, load_manifest
 from fusion.pairing import report_lines
 from fusion.pipeline import Fuser
 from fusion.provenance import describe_run
@@ -89,12 +89,13 @@ def run_blend(
         raise UsageError(f"{workers} is no number of threads", where="--workers", hint=f"1 to {MAX_WORKERS}")
     if out is not None:
         refuse_overlap(inputs, out)
-    with quiet_libraries(), closing(open_inputs(settings, inputs, dataset)) as pairs:
+    manifest = manifest_of(dataset, settings, inputs)
+    with quiet_libraries(), closing(open_inputs(settings, inputs, manifest)) as pairs:
         report_pairing(pairs, settings.strict, show=dry_run)
         if out is None or (dry_run and not preview):
             return
         fuser = Fuser(pairs, settings)
-        warn(fuser.registration.notes)
+        warn([*unlike_the_manifest(manifest, pairs), *fuser.registration.notes])
         if dry_run:
             replace_file(out / PREVIEW, _preview_png(fuser))
             print(f"preview: {out / PREVIEW}")
@@ -118,15 +119,13 @@ def warn(warnings: Iterable[str]) -> None:
         print(f"fusion: warning: {warning}", file=sys.stderr)
 
 
-def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | None) -> Pairs:
-    """The pairs of two inputs, of one 4-channel input, or of a data set's root."""
+def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str]) -> Manifest | None:
+    """The manifest that `--dataset` names; an unregistered set is refused without a registration."""
     if dataset is None:
-        fir = inputs[1] if len(inputs) == 2 else None
-        return open_pairs(inputs[0], fir, settings.pairing.rule(), fir_colour=settings.thermal.fir_colour)
+        return None
     if len(inputs) != 1:
-        raise UsageError(
-            "a data set has one root", where="--dataset", hint="fusion blend --dataset NAME ROOT -o OUT"
-        )
+        hint = "fusion blend --dataset NAME ROOT -o OUT"
+        raise UsageError("a data set has one root", where="--dataset", hint=hint)
     manifest = load_manifest(dataset)
     if not manifest.registered and not (settings.warp.homography or settings.warp.points):
         raise InputError(
@@ -134,11 +133,27 @@ def open_inputs(settings: BlendConfig, inputs: Sequence[str], dataset: str | Non
             where=f"data set {manifest.name}",
             hint="give --homography FILE or --points CSV",
         )
-    root = Path(inputs[0])
-    rgb, fir = manifest.globs(root)
-    given = settings.pairing.model_fields_set
-    rule = settings.pairing.rule() if given else manifest.pairing_rule(root)
-    return open_pairs(rgb, fir, rule, fir_colour=settings.thermal.fir_colour)
+    return manifest
+
+
+def open_inputs(settings: BlendConfig, inputs: Sequence[str], manifest: Manifest | None) -> Pairs:
+    """The pairs of two inputs, of one 4-channel input, or of a data set's root."""
+    rule, fir_colour = settings.pairing.rule(), settings.thermal.fir_colour
+    if manifest is None:
+        return open_pairs(inputs[0], inputs[1] if len(inputs) == 2 else None, rule, fir_colour=fir_colour)
+    rgb, fir = manifest.globs(inputs[0])
+    if not settings.pairing.model_fields_set:
+        rule = manifest.pairing_rule(inputs[0])
+    return open_pairs(rgb, fir, rule, fir_colour=fir_colour)
+
+
+def unlike_the_manifest(manifest: Manifest | None, pairs: Pairs) -> list[str]:
+    """In what the first pair and their number differ from what the data set is known to be."""
+    with suppress(FrameError):  # a first pair that cannot be read is reported as any other
+        if manifest is not None:
+            frames = pairs.read(0)
+            return manifest.differences(pairs=len(pairs), rgb=frames.rgb, fir=frames.fir)
+    return []
 
 
 def report_pairing(pairs: Pairs, strict: bool, *, show: bool) -> None:

@@ -328,6 +328,16 @@ def test_an_unregistered_data_set_needs_a_registration(fusion: Fusion, tmp_path:
     assert answer.code == 0, answer.err
 
 
+def test_a_data_set_that_is_not_as_known_is_told(fusion: Fusion, tmp_path: Path) -> None:
+    rgb, fir = write_pairs(tmp_path / "set" / "train", 2)
+    rgb.rename(rgb.with_name("vi"))
+    fir.rename(fir.with_name("ir"))
+    answer = fusion("blend", "--dataset", "msrs", tmp_path / "set", "-o", tmp_path / "out")
+    assert answer.code == 0, answer.err
+    assert "RGB size: msrs has (640, 480), found (64, 48)" in answer.err
+    assert sorted(p.name for p in (tmp_path / "out/fused/train/vi").iterdir()) == ["f000.png", "f001.png"]
+
+
 def test_help_is_there_and_loads_nothing_heavy() -> None:
     code = (
         "import sys\nsys.argv = ['fusion', '--help']\nfrom fusion.cli.main import main\n"
