@@ -1,6 +1,6 @@
-"""The common kind of PNG, decoded several times faster than libpng with zlib does it.
+"""The common kind of PNG, decoded faster than libpng with zlib does it.
 
-Inflating decides: ISA-L's takes a third of zlib's time. Only whole, plain files are decoded here (grey or
+Inflating decides, and ISA-L inflates faster than zlib. Only whole, plain files are decoded here (grey or
 RGB of 8 or 16 bits, not interlaced, no palette or transparency); for everything else, and at the first sign
 of damage, the answer is None and OpenCV is asked, which also knows what to say. Format: W3C, Portable
 Network Graphics (PNG) Specification, 2nd edition: chunks in section 5, filters in section 9.
