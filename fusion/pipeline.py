@@ -131,7 +131,7 @@ class Fuser:
         return fused, warp.mask
 
     def _flags(self, frames: FrameSet, window: Window) -> tuple[str, ...]:
-        # percentiles that coincide: the planner widened them to one count
+        # percentiles within one count: nothing to see, or the planner has widened a single value
         flat = self.config.thermal.window_unit == "percentile" and window.hi - window.lo <= 1
         return (*frames.rgb.flags, *frames.fir.flags, *(("fir-flat",) if flat else ()))
 

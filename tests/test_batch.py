@@ -200,3 +200,23 @@ def test_any_sink_will_do(tmp_path: Path) -> None:
     assert (report.fused, report.kept) == (2, 1)
     assert [frame.stem for frame in shelf.frames] == ["f000", "f002"]
     assert [row.stem for row in shelf.rows] == ["f000", "f001", "f002"]
+
+
+def test_an_interrupted_run_says_so_and_goes_on(tmp_path: Path) -> None:
+    rgb, fir = write_pairs(tmp_path, 48, rgb_size_wh=(640, 480), fir_size_wh=(320, 240))
+    out = tmp_path / "out"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [*COMMAND, str(rgb), str(fir), "--workers", "2", "-o", str(out)]
+    process = subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    while process.poll() is None and len(list((out / "fused").glob("*.png"))) < 5:
+        time.sleep(0.001)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate()[1]
+    assert process.returncode == 130
+    assert "fusion: interrupted; the same command goes on" in said
+    assert "Traceback" not in said
+    again = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert again.returncode == 0
+    assert "kept from before" in again.stdout

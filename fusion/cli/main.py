@@ -32,6 +32,7 @@ app = App(
     version=lambda: version("fusionprep"),
     help_format="plaintext",
     default_parameter=Parameter(negative=()),
+    suppress_keyboard_interrupt=False,  # ours says how to go on
 )
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
 datasets = App(name="datasets", help="List and show the data sets whose layout is known.")

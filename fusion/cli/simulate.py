@@ -22,7 +22,7 @@ def simulate_pairs(
 
     `fusion simulate pairs sample`
 
-    `fusion blend sample/rgb sample/fir --points sample/points.csv -o fused`
+    `fusion blend sample/rgb sample/fir --pair index --points sample/points.csv -o fused`
 
     Parameters
     ----------
