@@ -5,7 +5,9 @@ Pixel arrays are never mutated by the stages that receive them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +71,36 @@ class FrameSet:
         if self.rgb.stamp_ns is None or self.fir.stamp_ns is None:
             return None
         return self.fir.stamp_ns - self.rgb.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """Points of one scan or of one map, in the LiDAR's frame: x forward, y left, z up.
+
+    `xyz_m` is N x 3 float32 (float64 where coordinates are large, as in LAS), finite, never exactly
+    (0, 0, 0), which is how scanners write "no return". `fields` holds what else is known of each point, N
+    values each, under the names ``intensity``, ``ring`` (0 is the lowest laser, integer), ``time_s`` (seconds)
+    or the file's own. `read` is how many points the file had; `dropped` says in one word each how many were
+    left out, and why (``nan``, ``zero``, ``range``, ``box``, ``voxel``, ``outlier``).
+    """
+
+    xyz_m: NDArray[np.float32] | NDArray[np.float64]
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    stem: str = ""
+    stamp_ns: int | None = None
+    read: int | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape, dtype = self.xyz_m.shape, self.xyz_m.dtype
+        if len(shape) != 2 or shape[1] != 3 or dtype not in (np.float32, np.float64):
+            raise ValueError(f"expected Nx3 float32 or float64 metres, got {shape} {dtype}")
+        for name, values in self.fields.items():
+            if values.shape != shape[:1]:
+                raise ValueError(f"expected {shape[0]} values of {name}, got {values.shape}")
+
+    def __len__(self) -> int:
+        return len(self.xyz_m)
 
 
 @dataclass(frozen=True, slots=True)

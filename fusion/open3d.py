@@ -1,0 +1,30 @@
+"""Open3D, imported when it is needed and not before: it takes about a second, and system libraries."""
+
+from __future__ import annotations
+
+import ctypes
+from contextlib import suppress
+from functools import lru_cache
+from typing import Any
+
+from fusion.errors import FusionError
+
+
+@lru_cache(maxsize=1)
+def load() -> Any:
+    """The module `open3d`. Raises `FusionError` that names the system packages it needs where it cannot load."""
+    _preload_libusb()
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        hint = "Debian, Ubuntu: apt-get install libgomp1 libx11-6 libgl1 libegl1 libusb-1.0-0; then pip install open3d-cpu"
+        raise FusionError(f"Open3D cannot be loaded: {error}", hint=hint) from None
+    return open3d
+
+
+def _preload_libusb() -> None:
+    """Open3D links libusb, which slim systems lack; a wheel carries it. Where both are missing, `load` says so."""
+    with suppress(ImportError, OSError):
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)

@@ -1,0 +1,1 @@
+"""A ray-cast mine, the sensors that fly through it, and the truth."""
