@@ -1,8 +1,8 @@
 """Poses (`T_dst_src`, 4 x 4) and camera models (project, unproject): pure arrays, float64.
 
-Cameras: x right, y down, z forward; pixel (0, 0) is the centre of the top-left one. LiDAR: x forward, y left,
-z up. A model's `project` takes N x 3 points in metres of the camera's frame to N x 2 pixels (u, v) and says which
-of them the model can see; `unproject` takes N x 2 pixels to N x 3 unit vectors.
+Cameras: x right, y down, z forward; pixel (0, 0) is the centre of the top-left one. LiDAR: x forward,
+y left, z up. A model's `project` takes N x 3 points in metres of the camera's frame to N x 2 pixels (u, v)
+and says which of them the model can see; `unproject` takes N x 2 pixels to N x 3 unit vectors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ RIGID_TOLERANCE = 1e-4  # calibration files are written with few decimals
 # --- poses
 
 
-def pose(rotation: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)), translation_m: ArrayLike = (0, 0, 0)) -> Floats:
+def pose(
+    rotation: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)), translation_m: ArrayLike = (0, 0, 0)
+) -> Floats:
     """The 4 x 4 matrix of a 3 x 3 rotation and a translation in metres."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation_m
@@ -45,7 +47,7 @@ def transform(T_dst_src: Floats, xyz_m: NDArray[np.floating[Any]]) -> Floats:
 
 
 def checked_pose(T: ArrayLike, where: object = "") -> Floats:
-    """`T` as a 4 x 4 (or 3 x 4) rigid transformation, its rotation made orthonormal to the last digit.
+    """`T` as a 4 x 4 (or 3 x 4) rigid transformation, its rotation made orthonormal.
 
     Raises `UsageError` where it is not finite, not rigid to 1e-4, a reflection, or of another shape.
     """
@@ -57,11 +59,17 @@ def checked_pose(T: ArrayLike, where: object = "") -> Floats:
     R = M[:3, :3]
     if np.abs(M[3] - (0, 0, 0, 1)).max() > 0 or np.abs(R @ R.T - np.eye(3)).max() > RIGID_TOLERANCE:
         hint = "the upper left 3x3 must be a rotation, the last row 0 0 0 1, lengths in metres"
-        raise UsageError("the transformation is not rigid (singular, scaled or sheared)", where=where, hint=hint)
+        raise UsageError(
+            "the transformation is not rigid (singular, scaled or sheared)", where=where, hint=hint
+        )
     if np.linalg.det(R) < 0:
-        raise UsageError("the transformation mirrors: its determinant is -1", where=where, hint="check the axes")
-    left, _, right = np.linalg.svd(R)
-    return pose(left @ right, M[:3, 3])
+        raise UsageError(
+            "the transformation mirrors: its determinant is -1", where=where, hint="check the axes"
+        )
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-12:
+        left, _, right = np.linalg.svd(R)
+        R = left @ right
+    return pose(R, M[:3, 3])
 
 
 def rotation_of_quat(quat_wxyz: ArrayLike) -> Floats:
@@ -108,7 +116,7 @@ class Camera(Protocol):
         ...
 
     def project(self, xyz_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Pixels N x 2 and which of the points the model can see (in front; inside its domain; not: in frame)."""
+        """Pixels N x 2, and which of the points the model can see at all: in frame or not."""
         ...
 
     def unproject(self, uv: Floats) -> Floats:
@@ -149,7 +157,9 @@ class PinholeCamera:
         checked_size(self.size_wh)
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}")
+            raise UsageError(
+                f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}"
+            )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise UsageError(f"{len(self.distortion)} distortion coefficients", hint="none, 4, 5 or 8")
 
@@ -187,7 +197,11 @@ class PinholeCamera:
             return math.inf
         r = np.linspace(0, 10, 20_001)[1:]
         falling = np.flatnonzero(np.diff(r * self._radial(r * r), prepend=0.0) <= 0)
-        return float(r[falling[0] - 1]) if falling.size and falling[0] else (math.inf if not falling.size else 0.0)
+        return (
+            float(r[falling[0] - 1])
+            if falling.size and falling[0]
+            else (math.inf if not falling.size else 0.0)
+        )
 
     def _coefficients(self) -> tuple[float, ...]:
         return (*self.distortion, *([0.0] * (8 - len(self.distortion))))
@@ -243,7 +257,9 @@ class FisheyeCamera:
         checked_size(self.size_wh)
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}")
+            raise UsageError(
+                f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}"
+            )
         if len(self.distortion) not in (0, 4):
             raise UsageError(f"{len(self.distortion)} fisheye coefficients", hint="none or 4")
 

@@ -12,18 +12,18 @@ from fusion.errors import FusionError
 
 @lru_cache(maxsize=1)
 def load() -> Any:
-    """The module `open3d`. Raises `FusionError` that names the system packages it needs where it cannot load."""
+    """The module `open3d`. Where it cannot load, raises `FusionError` that names the system packages."""
     _preload_libusb()
     try:
         import open3d
     except (ImportError, OSError) as error:
-        hint = "Debian, Ubuntu: apt-get install libgomp1 libx11-6 libgl1 libegl1 libusb-1.0-0; then pip install open3d-cpu"
+        hint = "pip install open3d-cpu; Debian: apt-get install libgomp1 libx11-6 libgl1 libegl1 libusb-1.0-0"
         raise FusionError(f"Open3D cannot be loaded: {error}", hint=hint) from None
     return open3d
 
 
 def _preload_libusb() -> None:
-    """Open3D links libusb, which slim systems lack; a wheel carries it. Where both are missing, `load` says so."""
+    """Open3D links libusb, which slim systems lack, and a wheel carries."""
     with suppress(ImportError, OSError):
         import libusb_package
 

@@ -1,0 +1,157 @@
+"""The rig: how its cameras see, and how its sensors stand to each other. `rig.toml` in and out.
+
+format = "fusion-rig/1"
+
+[cameras.rgb]
+model = "pinhole"                # or fisheye
+size_wh = [640, 480]
+focal_px = [520.0, 520.0]
+centre_px = [319.5, 239.5]       # (0, 0) is the centre of the top-left pixel
+distortion = [-0.1, 0.02, 0.0, 0.0, 0.0]   # pinhole: none, 4, 5 or 8; fisheye: none or 4
+
+[transforms]
+T_rgb_lidar = [[0, -1, 0, 0.05], [0, 0, -1, 0.1], [1, 0, 0, 0], [0, 0, 0, 1]]
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError
+
+from fusion.errors import UsageError
+from fusion.files import replace_file
+from fusion.geometry import FisheyeCamera, Floats, PinholeCamera, checked_pose, invert
+
+FORMAT = "fusion-rig/1"
+RigCamera = PinholeCamera | FisheyeCamera
+_LARGEST_FILE_BYTES = 1 << 24
+_TRANSFORM = re.compile(r"T_([a-z0-9]+)_([a-z0-9]+)")
+_MODELS: dict[str, type[PinholeCamera] | type[FisheyeCamera]] = {
+    "pinhole": PinholeCamera,
+    "fisheye": FisheyeCamera,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Cameras by name (``rgb``, ``fir``), and rigid 4 x 4 transformations by ``T_dst_src``."""
+
+    cameras: Mapping[str, RigCamera] = field(default_factory=dict)
+    transforms: Mapping[str, Floats] = field(default_factory=dict)
+
+    def camera(self, name: str) -> RigCamera:
+        """The camera `name`. Raises `UsageError` that lists those there are."""
+        if name not in self.cameras:
+            hint = f"the rig has {', '.join(sorted(self.cameras)) or 'none'}"
+            raise UsageError(f"no camera {name!r} in the rig", hint=hint)
+        return self.cameras[name]
+
+    def pose(self, dst: str, src: str) -> Floats:
+        """T_dst_src, 4 x 4, along the shortest chain of known transformations, inverted where need be.
+
+        Raises `UsageError` where nothing links the two.
+        """
+        chains: dict[str, Floats] = {src: checked_pose([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])}
+        reached = [src]
+        for sensor in reached:
+            for a, b, T_a_b in self._links():
+                if b == sensor and a not in chains:
+                    chains[a] = T_a_b @ chains[sensor]
+                    reached.append(a)
+        if dst not in chains:
+            hint = f"it has {', '.join(sorted(self.transforms)) or 'no transformation'}"
+            raise UsageError(f"the rig does not say how {dst} stands to {src}", hint=hint)
+        return chains[dst]
+
+    def _links(self) -> list[tuple[str, str, Floats]]:
+        links = []
+        for name, T in self.transforms.items():
+            dst, src = _sensors(name)
+            links += [(dst, src, T), (src, dst, invert(T))]
+        return links
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig.toml. Raises `UsageError` naming the file and the key."""
+    try:
+        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
+            raise UsageError("too large for a rig", where=path)
+        text = Path(path).read_text(encoding="utf-8")
+        content = _RigFile.model_validate(tomllib.loads(text))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"the rig cannot be read: {reason}", where=path) from None
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in problem["loc"])
+        raise UsageError(
+            f"{key}: {problem['msg'].lower()}", where=path, hint="see docs/conventions.md"
+        ) from None
+    try:
+        cameras = {name: entry.camera() for name, entry in content.cameras.items()}
+        transforms = {}
+        for name, matrix in content.transforms.items():
+            _sensors(name)
+            transforms[name] = checked_pose(matrix)
+    except UsageError as error:
+        raise UsageError(error.what, where=path, hint=error.hint) from None
+    return Rig(cameras, transforms)
+
+
+def save_rig(path: str | Path, rig: Rig) -> None:
+    """Write a rig.toml; reading it gives the same numbers. Raises `OutputError`."""
+    content = {
+        "format": FORMAT,
+        "cameras": {name: _entry(camera) for name, camera in rig.cameras.items()},
+        "transforms": {name: [[float(x) for x in row] for row in T] for name, T in rig.transforms.items()},
+    }
+    replace_file(Path(path), tomlkit.dumps(content).encode())
+
+
+class _CameraEntry(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    model: Literal["pinhole", "fisheye"]
+    size_wh: tuple[PositiveInt, PositiveInt]
+    focal_px: tuple[FiniteFloat, FiniteFloat]
+    centre_px: tuple[FiniteFloat, FiniteFloat]
+    distortion: tuple[FiniteFloat, ...] = ()
+
+    def camera(self) -> RigCamera:
+        return _MODELS[self.model](self.size_wh, *self.focal_px, *self.centre_px, self.distortion)
+
+
+_Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
+
+
+class _RigFile(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    format: Literal["fusion-rig/1"]
+    cameras: dict[str, _CameraEntry] = {}
+    transforms: dict[str, Annotated[list[_Row], Field(min_length=3, max_length=4)]] = {}
+
+
+def _entry(camera: RigCamera) -> dict[str, object]:
+    model = next(name for name, kind in _MODELS.items() if isinstance(camera, kind))
+    return {
+        "model": model,
+        "size_wh": list(camera.size_wh),
+        "focal_px": [float(camera.fx), float(camera.fy)],
+        "centre_px": [float(camera.cx), float(camera.cy)],
+        "distortion": [float(k) for k in camera.distortion],
+    }
+
+
+def _sensors(name: str) -> tuple[str, str]:
+    found = _TRANSFORM.fullmatch(name)
+    if found is None:
+        raise UsageError(f"{name!r} is no transformation's name", hint="T_dst_src, such as T_rgb_lidar")
+    return found[1], found[2]
