@@ -30,11 +30,11 @@ def project(
 ) -> SparseDepth:
     """The thesis's list (r_i, c_i, d_i) of a cloud: exact, not rounded, every point of its own.
 
-    `value` is "range", distance to the camera's centre (the thesis's d), or "depth", along its axis. A point is
-    kept if the camera model can see it at all (in front of a pinhole, inside the radius where its distortion
-    is valid), if it falls into the picture, and if its value lies in `limits_m`. The order is the cloud's; rings are
-    those of its field ``ring``. `counts` has read, finite, in_front, in_frame, in_range. Raises `UsageError`
-    for depth of a camera that has no axis, and for a transformation that is not rigid.
+    `value` is "range", distance to the camera's centre (the thesis's d), or "depth", along its axis. A
+    point is kept if the camera model can see it at all (in front of a pinhole, inside the radius where its
+    distortion is valid), if it falls into the picture, and if its value lies in `limits_m`. The order is the
+    cloud's; rings are those of its field ``ring``. `counts` has read, finite, in_front, in_frame, in_range.
+    Raises `UsageError` for depth of a camera that has no axis, and for a transformation that is not rigid.
     """
     check_value(camera, value)
     T = checked_pose(T_cam_lidar, where="T_cam_lidar")
@@ -98,10 +98,9 @@ def _parts(
     counts: NDArray[np.int64],
 ) -> Iterator[Samples]:
     """The samples of a chunk of points after the other; `counts` grows by in front, in frame, in range."""
-    straight = isinstance(camera, PinholeCamera) and not any(camera.distortion)
     for first in range(0, max(len(cloud), 1), _CHUNK):
         xyz = cloud.xyz_m[first : first + _CHUNK]
-        if straight:
+        if isinstance(camera, PinholeCamera) and not any(camera.distortion):
             yield _through_pinhole(xyz, camera, T, use_range, limits_m, first, counts)
         else:
             yield _through_model(xyz, camera, T, use_range, limits_m, first, counts)
