@@ -49,7 +49,7 @@ def test_unusable_frames_are_skipped_counted_and_named(tmp_path: Path) -> None:
     (fir / "f003.png").write_bytes(whole[: len(whole) // 2])
     report = fuse_to(tmp_path / "out", rgb, fir)
     assert (report.fused, [stem for stem, _ in report.skipped]) == (4, ["f001", "f003"])
-    rows = {row.stem: row for row in read_rows(tmp_path / "out/frames.csv")}
+    rows = {row.stem: row for row in read_rows(tmp_path / "out/frames.csv", Row)}
     assert [rows[f"f{i:03d}"].status for i in range(6)] == [
         "fused",
         "skipped",
@@ -137,7 +137,7 @@ def test_a_run_killed_at_any_moment_goes_on_to_the_same_bytes(tmp_path: Path) ->
         process.send_signal(signal.SIGKILL)
         kills += process.wait() == -signal.SIGKILL
     assert kills == 4
-    journal = read_rows(out / ".partial/journal.csv", header=False)
+    journal = read_rows(out / ".partial/journal.csv", Row, header=False)
     finished = {row.stem: (out / f"fused/{row.stem}.png").stat().st_mtime_ns for row in journal}
     assert 0 < len(finished) < 48
     subprocess.run([*command, str(out)], check=True, env=environment, capture_output=True)

@@ -1,51 +1,34 @@
-"""A folder of fused frames with their index: atomic, resumable, the same bytes every time.
+"""A folder of fused frames with their index.
 
-    OUT/fused/<stem>.png|jpg   the frames
-    OUT/mask/<stem>.png        255 where thermal was seen, only where that is not everywhere
-    OUT/frames.csv             one row per pair (`sinks.index.Row`)
-    OUT/run.toml               effective configuration, registration, window, versions, hashes
-
-While a run is under way `OUT/.partial` holds temporary files and a journal of finished rows; it is
-gone when the run is complete. A finished frame is one whose row is in the journal or the index, whose
-file is there with the size of the row and is no older than its inputs.
+OUT/fused/<stem>.png|jpg   the frames
+OUT/mask/<stem>.png        255 where thermal was seen, only where that is not everywhere
+OUT/frames.csv             one row per pair (`sinks.index.Row`)
+OUT/run.toml               effective configuration, registration, window, versions, hashes
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import threading
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import tomlkit
 from numpy.typing import NDArray
-from tomlkit.exceptions import TOMLKitError
 
 from fusion.codecs import encode_jpeg, encode_png
-from fusion.errors import OutputError
-from fusion.files import output_error, replace_file
 from fusion.frames import FusedFrame
-from fusion.sinks.index import Row, read_rows, to_csv
-
-try:
-    import fcntl
-except ImportError:  # not on Windows: there, two runs into one folder are not kept apart
-    fcntl = None
-
-RUN_FORMAT = "fusion-run/1"
+from fusion.sinks.index import Row
+from fusion.sinks.run_folder import RunFolder, inside
 
 
-class FolderSink:
-    """Writes fused frames into the folder `out`; see the module's text for the layout.
+class FolderSink(RunFolder[Row]):
+    """Writes fused frames into the folder `out`; resumable, see `run_folder`.
 
-    `run` is what makes this run what it is (nested, TOML-able); a folder that holds another run's
-    frames is refused with the first difference named, unless `overwrite`, which deletes the frames that the
-    index there lists and nothing else. PNG is lossless; JPEG has `quality` 1 to 100.
+    PNG is lossless; JPEG has `quality` 1 to 100.
     """
+
+    row_kind = Row
+    main_folder = "fused"
 
     def __init__(
         self,
@@ -56,63 +39,9 @@ class FolderSink:
         quality: int = 90,
         overwrite: bool = False,
     ) -> None:
-        self.out = Path(out)
-        self._run = {"format": RUN_FORMAT, **(run or {})}
-        self._suffix, self._quality, self._overwrite = f".{image_format}", quality, overwrite
-        self._partial = self.out / ".partial"
-        self._journal: IO[str] | None = None
-        self._done: dict[str, Row] = {}
-        self._rows: list[Row] = []
+        super().__init__(out, run, overwrite=overwrite)
+        self._suffix, self._quality = f".{image_format}", quality
         self._encoded_mask: tuple[NDArray[np.uint8], bytes] | None = None
-        self._lock_fd: int | None = None
-
-    def __enter__(self) -> FolderSink:
-        try:
-            self._open()
-        except OSError as error:
-            self._close()
-            raise output_error(error, self.out) from None
-        except BaseException:
-            self._close()
-            raise
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        try:
-            if kind is None:
-                self._complete()
-        except OSError as error:
-            raise output_error(error, self.out) from None
-        finally:
-            self._close()
-
-    def expect(self, stems: Iterable[str]) -> None:
-        """Refuse, before a frame is written, names that would fall onto one file on this disk."""
-        (self.out / "fused").mkdir(exist_ok=True)
-        blind_to_case = (self.out / "FUSED").exists()
-        seen: dict[str, str] = {}
-        for stem in stems:
-            file = stem.casefold() if blind_to_case else stem
-            if file in seen:
-                raise OutputError(
-                    f"{seen[file]!r} and {stem!r} would be one file: one would overwrite the other",
-                    where=self.out,
-                    hint="rename one of the images",
-                )
-            seen[file] = stem
-
-    def finished(self, stem: str, changed_ns: int) -> Row | None:
-        row = self._done.get(stem)
-        if row is None:
-            return None
-        with suppress(OSError, ValueError):
-            frame = self._frame_path(stem).stat()
-            whole = frame.st_size == int(row.size)
-            if row.mask_size:
-                whole = whole and self._mask_path(stem).stat().st_size == int(row.mask_size)
-            if whole and frame.st_mtime_ns >= changed_ns:
-                return row
-        return None
 
     def write(self, frame: FusedFrame, fir_stem: str) -> Row:
         lossless = self._suffix == ".png"
@@ -125,143 +54,21 @@ class FolderSink:
         self._replace(self._frame_path(frame.stem), data)
         return Row.fused(frame, fir_stem, len(data), mask_size)
 
-    def record(self, row: Row) -> None:
-        if self._journal is None:
-            raise OutputError("the sink is not open", where=self.out, hint="use it in a with block")
-        self._rows.append(row)
-        if row.status == "skipped" and row.stem in self._done:
-            self._unlink(row.stem)  # its inputs were good once: what is left of it is stale
-        if row.status == "fused" and self._done.get(row.stem) != row:
-            try:
-                self._journal.write(to_csv([row], header=False))
-                self._journal.flush()
-            except OSError as error:
-                raise output_error(error, self._partial) from None
+    def files(self, row: Row) -> Mapping[Path, int]:
+        files = {self._frame_path(row.stem): int(row.size)}
+        return {**files, self._mask_path(row.stem): int(row.mask_size)} if row.mask_size else files
 
-    def write_file(self, name: str, data: bytes) -> Path:
-        """Put one more file (a picture, a table) beside the index, by rename."""
-        self._replace(self.out / name, data)
-        return self.out / name
-
-    # --- opening and closing
-
-    def _open(self) -> None:
-        if self.out.exists() and not self.out.is_dir():
-            raise OutputError("is a file, not a folder", where=self.out, hint="choose another -o")
-        self.out.mkdir(parents=True, exist_ok=True)
-        self._lock()
-        journal, index = self._partial / "journal.csv", self.out / "frames.csv"
-        rows = [*read_rows(index), *read_rows(journal, header=False)]
-        if self._overwrite:
-            self._delete(rows)
-        else:
-            self._refuse_another_run(rows)
-            self._done = {row.stem: row for row in rows if row.status == "fused"}
-        self._partial.mkdir(exist_ok=True)
-        for leftover in self._partial.glob("*.tmp"):
-            leftover.unlink()
-        self._replace(self.out / "run.toml", tomlkit.dumps(self._run).encode())
-        self._replace(journal, to_csv(self._done.values(), header=False).encode("utf-8", "surrogateescape"))
-        self._journal = journal.open("a", encoding="utf-8", errors="surrogateescape", newline="")
-
-    def _lock(self) -> None:
-        if fcntl is None:
-            return
-        self._lock_fd = os.open(self.out, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock_fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError("another run is writing here", where=self.out, hint="wait for it") from None
-
-    def _refuse_another_run(self, rows: list[Row]) -> None:
-        path = self.out / "run.toml"
-        hint = "choose another -o, or pass --overwrite to replace that run's frames"
-        if not path.exists():
-            if rows or any((self.out / "fused").glob("*")):
-                raise OutputError(
-                    "holds frames, but no run.toml that says whose they are", where=self.out, hint=hint
-                )
-            return
-        try:
-            before = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
-        except (ValueError, TOMLKitError) as error:
-            raise OutputError(f"its run.toml cannot be read: {error}", where=self.out, hint=hint) from None
-        difference = first_difference(before, self._run)
-        if difference:
-            raise OutputError(f"holds another run ({difference})", where=self.out, hint=hint)
-
-    def _delete(self, rows: list[Row]) -> None:
-        for row in rows:
-            for path in (
-                *(self._frame_path(row.stem, s) for s in (".png", ".jpg")),
-                self._mask_path(row.stem),
-            ):
-                path.unlink(missing_ok=True)
-        for name in ("frames.csv", "run.toml", "unmatched.csv", "preview.png"):
-            (self.out / name).unlink(missing_ok=True)
-        shutil.rmtree(self._partial, ignore_errors=True)
-
-    def _complete(self) -> None:
-        self._replace(self.out / "frames.csv", to_csv(self._rows).encode("utf-8", "surrogateescape"))
-        if self._journal is not None:
-            self._journal.close()
-        shutil.rmtree(self._partial)
-
-    def _close(self) -> None:
-        if self._journal is not None:
-            with suppress(OSError):  # a full disk has been reported by the write that met it
-                self._journal.close()
-            self._journal = None
-        if self._lock_fd is not None:
-            os.close(self._lock_fd)
-            self._lock_fd = None
-
-    # --- files
-
-    def _unlink(self, stem: str) -> None:
-        for path in (*(self._frame_path(stem, s) for s in (".png", ".jpg")), self._mask_path(stem)):
-            path.unlink(missing_ok=True)
+    def paths(self, stem: str) -> Iterable[Path]:
+        return (*(self._frame_path(stem, suffix) for suffix in (".png", ".jpg")), self._mask_path(stem))
 
     def _frame_path(self, stem: str, suffix: str | None = None) -> Path:
-        return self.out / "fused" / f"{_inside(stem)}{suffix or self._suffix}"
+        return self.out / "fused" / f"{inside(stem)}{suffix or self._suffix}"
 
     def _mask_path(self, stem: str) -> Path:
-        return self.out / "mask" / f"{_inside(stem)}.png"
+        return self.out / "mask" / f"{inside(stem)}.png"
 
     def _mask_png(self, mask: NDArray[np.uint8]) -> bytes:
         known = self._encoded_mask
         if known is None or known[0] is not mask:  # a fixed warp hands out one and the same array
             known = self._encoded_mask = (mask, encode_png(mask))
         return known[1]
-
-    def _replace(self, path: Path, data: bytes) -> None:
-        replace_file(path, data, self._partial / f"{threading.get_ident()}.tmp")
-
-
-def first_difference(before: Any, now: Any, key: str = "") -> str | None:
-    """The first key, in words, in which two nested settings differ; None where they agree."""
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in sorted({*before, *now}):
-            inner = first_difference(before.get(name), now.get(name), f"{key}.{name}" if key else name)
-            if inner:
-                return inner
-        return None
-    if isinstance(before, list | tuple) and isinstance(now, list | tuple) and len(before) == len(now):
-        for a, b in zip(before, now, strict=True):
-            inner = first_difference(a, b, key)
-            if inner:
-                return inner
-        return None
-    return None if before == now else f"{key} was {_short(before)}, is {_short(now)}"
-
-
-def _short(value: Any) -> str:
-    text = "not there" if value is None else repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-def _inside(stem: str) -> str:
-    path = PurePosixPath(stem)
-    if path.is_absolute() or ".." in path.parts or not path.parts:
-        raise OutputError(f"the name {stem!r} leads out of the output folder")
-    return stem

@@ -1,4 +1,4 @@
-"""`frames.csv`: one row per pair, what became of it and how."""
+"""`frames.csv`: one row per frame, what became of it and how."""
 
 from __future__ import annotations
 
@@ -8,9 +8,27 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from fusion.errors import FrameError
 from fusion.frames import FusedFrame
+
+
+class IndexRow(Protocol):
+    """A frozen dataclass of strings: a row of an index, its fields the columns."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def stem(self) -> str: ...
+
+    @property
+    def done(self) -> bool:
+        """Whether there is a frame: else its reason says why not."""
+        ...
+
+
+RowT = TypeVar("RowT", bound=IndexRow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +55,10 @@ class Row:
     flags: str = ""
     reason: str = ""
 
+    @property
+    def done(self) -> bool:
+        return self.status == "fused"
+
     @classmethod
     def fused(cls, frame: FusedFrame, fir_stem: str, size: int = 0, mask_size: int | None = None) -> Row:
         rgb_ns, fir_ns = frame.rgb_stamp_ns, frame.fir_stamp_ns
@@ -62,20 +84,21 @@ class Row:
         return cls(stem, fir_stem, "skipped", reason=error.what)
 
 
-COLUMNS = tuple(field.name for field in fields(Row))
-_cells = attrgetter(*COLUMNS)  # `astuple` would copy every value deeply
+def columns_of(kind: type[IndexRow]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
 
 
-def to_csv(rows: Iterable[Row], header: bool = True) -> str:
+def to_csv(rows: Iterable[RowT], kind: type[RowT], header: bool = True) -> str:
+    columns = columns_of(kind)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     if header:
-        writer.writerow(COLUMNS)
-    writer.writerows(map(_cells, rows))
+        writer.writerow(columns)
+    writer.writerows(map(attrgetter(*columns), rows))  # `astuple` would copy every value deeply
     return text.getvalue()
 
 
-def read_rows(path: Path, *, header: bool = True) -> list[Row]:
+def read_rows(path: Path, kind: type[RowT], *, header: bool = True) -> list[RowT]:
     """The whole rows of a CSV. A last line that a killed run left half written does not count."""
     try:
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
@@ -83,4 +106,5 @@ def read_rows(path: Path, *, header: bool = True) -> list[Row]:
         return []
     whole = text[: text.rfind("\n") + 1]
     cells = list(csv.reader(io.StringIO(whole, newline="")))
-    return [Row(*row) for row in cells[1 if header else 0 :] if len(row) == len(COLUMNS)]
+    width = len(columns_of(kind))
+    return [kind(*row) for row in cells[1 if header else 0 :] if len(row) == width]

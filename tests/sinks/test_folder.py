@@ -7,8 +7,9 @@ import pytest
 
 from fusion.errors import FrameError, OutputError
 from fusion.frames import FusedFrame, Window
-from fusion.sinks.folder import FolderSink, first_difference
-from fusion.sinks.index import COLUMNS, Row, read_rows, to_csv
+from fusion.sinks.folder import FolderSink
+from fusion.sinks.index import Row, columns_of, read_rows, to_csv
+from fusion.sinks.run_folder import first_difference
 from tests.worlds import read, tree
 
 
@@ -39,7 +40,7 @@ def test_layout_and_index(tmp_path: Path) -> None:
     ]
     assert np.array_equal(read(tmp_path / "out/fused/sub/ä.png"), frame("x").bgr)
     assert np.array_equal(read(tmp_path / "out/mask/sub/ä.png")[:, :2], np.tile([[0, 255]], (6, 1)))
-    row = read_rows(tmp_path / "out/frames.csv")[0]
+    row = read_rows(tmp_path / "out/frames.csv", Row)[0]
     assert (row.stem, row.fir_stem, row.status, row.dt_ns, row.window_lo, row.coverage) == (
         "a b",
         "t_a b",
@@ -57,16 +58,16 @@ def test_names_with_commas_quotes_and_newlines_survive_the_index(tmp_path: Path)
         Row('a,"b"', "c\nd", "fused"),
         Row.skipped("x", "y", FrameError("half a file", where="/secret/path")),
     ]
-    (tmp_path / "i.csv").write_text(to_csv(rows), encoding="utf-8")
-    assert read_rows(tmp_path / "i.csv") == rows
-    assert "/secret" not in to_csv(rows)
+    (tmp_path / "i.csv").write_text(to_csv(rows, Row), encoding="utf-8")
+    assert read_rows(tmp_path / "i.csv", Row) == rows
+    assert "/secret" not in to_csv(rows, Row)
 
 
 @pytest.mark.parametrize("cut", range(1, 30, 3))
 def test_a_half_written_last_row_does_not_count(tmp_path: Path, cut: int) -> None:
-    text = to_csv([Row("a", "b", "fused", size="1"), Row("c", "d", "fused", size="2")], header=False)
+    text = to_csv([Row("a", "b", "fused", size="1"), Row("c", "d", "fused", size="2")], Row, header=False)
     (tmp_path / "j.csv").write_text(text[:-cut])
-    assert [row.stem for row in read_rows(tmp_path / "j.csv", header=False)] in (
+    assert [row.stem for row in read_rows(tmp_path / "j.csv", Row, header=False)] in (
         [["a"]] if cut < 20 else [["a"], []]
     )
 
@@ -84,7 +85,7 @@ def test_leaving_on_an_error_keeps_the_journal_and_the_next_run_goes_on(tmp_path
         assert sink.finished("b", 0) is None
         sink.record(kept)
     assert not (out / ".partial").exists()
-    assert [row.stem for row in read_rows(out / "frames.csv")] == ["a"]
+    assert [row.stem for row in read_rows(out / "frames.csv", Row)] == ["a"]
 
 
 def test_a_finished_frame_counts_only_when_whole_and_newer_than_its_inputs(tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_first_difference_names_the_deepest_key() -> None:
     assert first_difference({"a": {"b": [1, 2]}}, {"a": {"b": (1, 2)}}) is None
     assert first_difference({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}) == "a.b was 2, is 3"
     assert first_difference({"a": 1}, {}) == "a was 1, is not there"
-    assert len(COLUMNS) == 15
+    assert len(columns_of(Row)) == 15
 
 
 def test_two_pairs_of_one_name_are_refused_before_one_overwrites_the_other(tmp_path: Path) -> None:
