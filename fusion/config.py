@@ -7,19 +7,19 @@ holds is what runs, and what `run.toml` records.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from fusion.errors import UsageError
 from fusion.pairing import PairingRule
+from fusion.settings import Group, first_problem, merged, read_settings
 from fusion.thermal import WindowRule
 
 FORMAT = "fusion-blend/1"
-MAX_CONFIG_BYTES = 1 << 20
+PATHS = (("warp", "homography"), ("warp", "points"), ("pairing", "map"))
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "auto": {
@@ -35,11 +35,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 Level = Annotated[int, Field(ge=0, le=255)]
 
 
-class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PairingConfig(_Group):
+class PairingConfig(Group):
     """Which thermal image belongs to which RGB image; keys are regular expressions on the stems."""
 
     by: Literal["auto", "stem", "index", "stamp", "map", "order"] = "auto"
@@ -53,7 +49,7 @@ class PairingConfig(_Group):
         return PairingRule(self.by, self.rgb_key, self.fir_key, tolerance_ns, self.map)
 
 
-class ThermalConfig(_Group):
+class ThermalConfig(Group):
     """The window that is stretched, and the colours it is given."""
 
     window: tuple[float, float]
@@ -71,7 +67,7 @@ class ThermalConfig(_Group):
         )
 
 
-class WarpConfig(_Group):
+class WarpConfig(Group):
     """How thermal comes onto the RGB grid, and what happens where it does not reach."""
 
     homography: str | None = None
@@ -80,17 +76,17 @@ class WarpConfig(_Group):
     fill_bgr: tuple[Level, Level, Level] = (0, 0, 0)
 
 
-class BlendingConfig(_Group):
+class BlendingConfig(Group):
     method: str = "alpha"
     alpha: float = Field(default=0.85, ge=0, le=1)
 
 
-class OutputConfig(_Group):
+class OutputConfig(Group):
     format: Literal["png", "jpg"] = "png"
     quality: int = Field(default=90, ge=1, le=100)
 
 
-class BlendConfig(_Group):
+class BlendConfig(Group):
     """The effective settings of one run. `BlendConfig.of(preset="thesis")` fills in a preset."""
 
     format: Literal["fusion-blend/1"] = FORMAT
@@ -113,26 +109,8 @@ def load_config(path: Path | None, overrides: Mapping[str, Any]) -> BlendConfig:
 
     Paths inside the file count from the file's own folder. Raises `UsageError` naming the key.
     """
-    settings = {} if path is None else _read_toml(path)
-    return _validated(_merged(settings, overrides), where="options" if path is None else str(path))
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UsageError("too large for a configuration", where=path)
-        settings = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"cannot be read as TOML: {error}", where=path) from None
-    if settings.get("format") != FORMAT:
-        raise UsageError(
-            "no configuration of ours", where=path, hint=f'its first line must be format = "{FORMAT}"'
-        )
-    for group, key in (("warp", "homography"), ("warp", "points"), ("pairing", "map")):
-        table = settings.get(group)
-        if isinstance(table, dict) and isinstance(table.get(key), str):
-            table[key] = str(path.parent / table[key])
-    return settings
+    settings = {} if path is None else read_settings(path, FORMAT, PATHS)
+    return _validated(merged(settings, overrides), where="options" if path is None else str(path))
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
@@ -142,29 +120,12 @@ def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
     thermal = settings.get("thermal", {})
     if isinstance(thermal, Mapping) and "window" in thermal and "window_unit" not in thermal:
         # a window given by hand is MATLAB's, whatever unit the preset's own window has
-        settings = _merged(settings, {"thermal": {"window_unit": "fraction"}})
+        settings = merged(settings, {"thermal": {"window_unit": "fraction"}})
     try:
-        config = BlendConfig.model_validate(_merged(PRESETS[preset], settings))
+        config = BlendConfig.model_validate(merged(PRESETS[preset], settings))
     except ValidationError as error:
-        raise UsageError(_first_problem(error), where=where) from None
+        raise UsageError(first_problem(error), where=where) from None
     if config.warp.homography and config.warp.points:
         raise UsageError("homography and points exclude each other", where=where, hint="give one of them")
     config.thermal.rule()
     return config
-
-
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in over.items():
-        known = merged.get(key)
-        merged[key] = (
-            _merged(known, value) if isinstance(known, Mapping) and isinstance(value, Mapping) else value
-        )
-    return merged
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in problem["loc"])
-    more = error.error_count() - 1
-    return f"{key}: {problem['msg'].lower()}" + (f" (and {more} more)" if more else "")

@@ -12,7 +12,8 @@ import fusion
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors", "frames"},
-    {"files", "tables", "codecs", "png", "unfilter", "kernels"},
+    {"files", "tables", "settings", "open3d", "codecs", "png", "unfilter", "kernels", "geometry"},
+    {"rig"},
     {
         "sources",
         "pairing",
@@ -23,9 +24,10 @@ FLOORS = [
         "thermal",
         "blend",
         "manifest",
-        "simulate",
+        "clouds",
     },
-    {"sync", "config"},
+    {"lidar"},
+    {"sync", "config", "simulate"},
     {"pipeline"},
     {"sinks", "provenance"},
     {"batch"},

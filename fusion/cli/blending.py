@@ -24,6 +24,7 @@ from fusion.pipeline import Fuser
 from fusion.provenance import describe_run
 from fusion.report.sheet import contact_sheet
 from fusion.report.text import closing_lines, plan_lines, warnings_of
+from fusion.settings import nested
 from fusion.sinks.folder import FolderSink
 from fusion.sources.folders import split_pattern
 from fusion.sync import Pairs, open_pairs
@@ -61,14 +62,7 @@ PLACES = {
 
 def settings_of(config: Path | None, options: Mapping[str, Any]) -> BlendConfig:
     """The configuration file with the options that were given laid over it."""
-    nested: dict[str, Any] = {}
-    for option, (*groups, key) in PLACES.items():
-        if options[option] is not None:
-            table = nested
-            for group in groups:
-                table = table.setdefault(group, {})
-            table[key] = options[option]
-    return load_config(config, nested)
+    return load_config(config, nested(PLACES, options))
 
 
 def run_blend(
