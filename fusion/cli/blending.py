@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
-from glob import has_magic
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-from fusion.batch import no_progress, opencv_on_one_thread, run
+from fusion.batch import opencv_on_one_thread, run
+from fusion.cli.running import progress_bar, quiet_libraries, refuse_overlap, threads_of, warn
 from fusion.codecs import encode_png
 from fusion.config import BlendConfig, load_config
-from fusion.errors import FrameError, InputError, OutputError, UsageError
+from fusion.errors import FrameError, InputError, UsageError
 from fusion.files import replace_file
 from fusion.manifest import Manifest, load_manifest
 from fusion.pairing import report_lines
@@ -26,11 +23,9 @@ from fusion.report.sheet import contact_sheet
 from fusion.report.text import closing_lines, plan_lines, warnings_of
 from fusion.settings import nested
 from fusion.sinks.folder import FolderSink
-from fusion.sources.folders import split_pattern
 from fusion.sync import Pairs, open_pairs
 
 PREVIEW = "preview.png"
-MAX_WORKERS = 256
 
 # option of the command -> its place in the configuration
 PLACES = {
@@ -79,10 +74,9 @@ def run_blend(
 ) -> None:
     if out is None and (preview or not dry_run):
         raise UsageError("no output folder", where="--out", hint="give -o OUT, or only --dry-run")
-    if workers is not None and not 1 <= workers <= MAX_WORKERS:
-        raise UsageError(f"{workers} is no number of threads", where="--workers", hint=f"1 to {MAX_WORKERS}")
+    threads = threads_of(workers)
     if out is not None:
-        refuse_overlap(inputs, out)
+        refuse_overlap(inputs, out, ("fused", "mask"))
     manifest = manifest_of(dataset, settings, inputs)
     with quiet_libraries(), closing(open_inputs(settings, inputs, manifest)) as pairs:
         report_pairing(pairs, settings.strict, show=dry_run)
@@ -99,18 +93,13 @@ def run_blend(
         with _sink(fuser, out, overwrite) as sink:
             if preview:
                 sink.write_file(PREVIEW, _preview_png(fuser))
-            with progress_bar(quiet) as progress:
-                report = run(fuser, sink, workers=workers or default_workers(), progress=progress)
+            with progress_bar("fusing", quiet) as progress:
+                report = run(fuser, sink, workers=threads, progress=progress)
             if pairs.pairing.unmatched:
                 sink.write_file("unmatched.csv", unmatched_csv(pairs))
         if not quiet:
             print("\n".join(closing_lines(fuser, report, out)))
         warn(warnings_of(fuser, report))
-
-
-def warn(warnings: Iterable[str]) -> None:
-    for warning in warnings:
-        print(f"fusion: warning: {warning}", file=sys.stderr)
 
 
 def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str]) -> Manifest | None:
@@ -160,82 +149,6 @@ def report_pairing(pairs: Pairs, strict: bool, *, show: bool) -> None:
             f"{len(pairing.unmatched)} images have no partner; the first: {first.where}: {first.reason}",
             hint="--dry-run lists them; without --strict they are left out",
         )
-
-
-def refuse_overlap(inputs: Sequence[str], out: Path) -> None:
-    """An output inside an input folder would be read as input the next time; the reverse would overwrite."""
-    target = out.resolve()
-    for spec in inputs:
-        folder = fixed_folder(spec)
-        if folder is None:
-            continue
-        if target == folder or folder in target.parents:
-            raise OutputError("lies inside the input folder", where=out, hint="choose another -o")
-        for ours in (target / "fused", target / "mask"):
-            if folder == ours or ours in folder.parents:
-                raise OutputError(f"would overwrite the input {spec}", where=out, hint="choose another -o")
-
-
-def fixed_folder(spec: str) -> Path | None:
-    """The folder that a folder or glob specification reads from; None for single files."""
-    path = Path(spec)
-    if path.is_dir():
-        return path.resolve()
-    return None if path.exists() or not has_magic(spec) else split_pattern(spec)[0].resolve()
-
-
-@contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """A bar with rate and time left on the terminal; nothing where there is none."""
-    if quiet or not sys.stderr.isatty():
-        yield no_progress
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]:.0f} frames/s"),
-        TimeRemainingColumn(),
-    )
-    with Progress("fusing", *columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("fusing", total=None, rate=0.0)
-        began = time.monotonic()
-
-        def advance(done: int, total: int) -> None:
-            rate = done / max(time.monotonic() - began, 1e-6)
-            bar.update(task, completed=done, total=total, rate=rate)
-
-        yield advance
-
-
-@contextmanager
-def quiet_libraries() -> Iterator[None]:
-    """Sends what C libraries write to standard error nowhere; Python's own words still arrive.
-
-    libpng and libtiff announce every damaged file by themselves; the frame is named in our report already.
-    """
-    sys.stderr.flush()
-    before, terminal = sys.stderr, os.dup(2)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        if before is sys.__stderr__:
-            sys.stderr = os.fdopen(os.dup(terminal), "w", buffering=1, errors="backslashreplace")
-        yield
-    finally:
-        if sys.stderr is not before:
-            sys.stderr.close()
-            sys.stderr = before
-        os.dup2(terminal, 2)
-        os.close(terminal)
-        os.close(nowhere)
-
-
-def default_workers() -> int:
-    """One thread for every core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def unmatched_csv(pairs: Pairs) -> bytes:
