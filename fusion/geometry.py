@@ -8,8 +8,9 @@ and says which of them the model can see; `unproject` takes N x 2 pixels to N x 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,7 @@ Floats = NDArray[np.float64]
 
 # A camera at the LiDAR's origin that looks along +x, upright.
 T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
+_LARGEST_COEFFICIENT = 1e9
 RIGID_TOLERANCE = 1e-4  # calibration files are written with few decimals
 
 
@@ -54,18 +56,19 @@ def checked_pose(T: ArrayLike, where: object = "") -> Floats:
     M = np.array(T, np.float64)
     if M.shape == (3, 4):
         M = np.vstack([M, (0, 0, 0, 1)])
-    if M.shape != (4, 4) or not np.isfinite(M).all():
-        raise UsageError(f"a transformation has 4x4 finite numbers, not {M.shape}", where=where)
+    if M.shape != (4, 4):
+        raise UsageError(f"a transformation has 4x4 or 3x4 numbers, not {M.shape}", where=where)
+    if not np.isfinite(M).all():
+        raise UsageError("the transformation holds a number that is not finite", where=where)
     R = M[:3, :3]
-    if np.abs(M[3] - (0, 0, 0, 1)).max() > 0 or np.abs(R @ R.T - np.eye(3)).max() > RIGID_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers: NaN, which is not close
+        rigid = bool(np.abs(R @ R.T - np.eye(3)).max() <= RIGID_TOLERANCE)
+    if not rigid or (M[3] != (0, 0, 0, 1)).any():
+        what = "the transformation is not rigid (singular, scaled or sheared)"
         hint = "the upper left 3x3 must be a rotation, the last row 0 0 0 1, lengths in metres"
-        raise UsageError(
-            "the transformation is not rigid (singular, scaled or sheared)", where=where, hint=hint
-        )
+        raise UsageError(what, where=where, hint=hint)
     if np.linalg.det(R) < 0:
-        raise UsageError(
-            "the transformation mirrors: its determinant is -1", where=where, hint="check the axes"
-        )
+        raise UsageError("the transformation mirrors (determinant -1)", where=where, hint="check the axes")
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-12:
         left, _, right = np.linalg.svd(R)
         R = left @ right
@@ -73,9 +76,15 @@ def checked_pose(T: ArrayLike, where: object = "") -> Floats:
 
 
 def rotation_of_quat(quat_wxyz: ArrayLike) -> Floats:
-    """3 x 3 rotation(s) of unit quaternion(s) (w, x, y, z): ... x 4 gives ... x 3 x 3."""
+    """3 x 3 rotation(s) of quaternion(s) (w, x, y, z), made unit: ... x 4 gives ... x 3 x 3.
+
+    Raises `ValueError` for one that is zero or not finite.
+    """
     q = np.asarray(quat_wxyz, np.float64)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    length = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not ((length > 0) & np.isfinite(length)).all():
+        raise ValueError("expected quaternions of finite length above 0")
+    w, x, y, z = np.moveaxis(q / length, -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -129,12 +138,42 @@ def checked_size(size_wh: tuple[int, int]) -> None:
         raise UsageError(f"an image of {size_wh[0]}x{size_wh[1]} pixels", hint="1 to 32768 each way")
 
 
-def checked_fov(fov_deg: float, below_deg: float, what: str) -> float:
-    """The angle in radians; `UsageError` unless 0 < fov < `below_deg`."""
-    if not (math.isfinite(fov_deg) and 0 < fov_deg < below_deg):
-        hint = f"more than 0 and less than {below_deg:g} degrees"
+def checked_fov(fov_deg: float, limit_deg: float, what: str, *, inclusive: bool = False) -> float:
+    """The angle in radians; `UsageError` unless 0 < fov < `limit_deg` (or equal to it if `inclusive`)."""
+    if not (0 < fov_deg < limit_deg or (inclusive and fov_deg == limit_deg)):
+        hint = f"more than 0, {'at most' if inclusive else 'less than'} {limit_deg:g}"
         raise UsageError(f"a {what} camera cannot have a field of view of {fov_deg:g} degrees", hint=hint)
     return math.radians(fov_deg)
+
+
+def _check_intrinsics(camera: PinholeCamera | FisheyeCamera, lengths: tuple[int, ...], what: str) -> None:
+    checked_size(camera.size_wh)
+    if not (0 < camera.fx < math.inf and 0 < camera.fy < math.inf):
+        raise UsageError(f"focal lengths must be positive numbers, not {camera.fx:g}, {camera.fy:g}")
+    if not (math.isfinite(camera.cx) and math.isfinite(camera.cy)):
+        raise UsageError(f"the centre must be finite numbers, not {camera.cx:g}, {camera.cy:g}")
+    if len(camera.distortion) not in lengths:
+        raise UsageError(f"{len(camera.distortion)} {what} coefficients", hint=f"one of {lengths}")
+    if not all(abs(k) <= _LARGEST_COEFFICIENT for k in camera.distortion):  # NaN is not, either
+        raise UsageError(f"{what} coefficients out of all bounds: {list(camera.distortion)}")
+
+
+def _least_root(*polynomials: Floats) -> float:
+    """The least positive root of polynomials 1 + c1 s + c2 s^2 + ..., inf where there is none."""
+    # Read backwards they are polynomials in 1/s with leading coefficient 1: nothing to divide by.
+    inverse = np.concatenate([np.roots(p) for p in polynomials])
+    real = inverse.real[(inverse.imag == 0) & (inverse.real > 0)]
+    return float(1 / real.max()) if real.size else math.inf
+
+
+def _inverse(radius: Callable[[Floats], Floats], values: Floats, top: float, steps: int) -> Floats:
+    """Where in [0, top], all of which it grows, `radius` has these values: by bisection."""
+    low, high = np.zeros_like(values), np.full_like(values, top)
+    for _ in range(steps):
+        middle = (low + high) / 2
+        below = radius(middle) < values
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return (low + high) / 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,17 +190,9 @@ class PinholeCamera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
-    has_axis: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        checked_size(self.size_wh)
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(
-                f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}"
-            )
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise UsageError(f"{len(self.distortion)} distortion coefficients", hint="none, 4, 5 or 8")
+        _check_intrinsics(self, (0, 4, 5, 8), "distortion")
 
     @classmethod
     def of_fov(cls, size_wh: tuple[int, int], fov_deg: float) -> PinholeCamera:
@@ -171,6 +202,10 @@ class PinholeCamera:
         f = size_wh[0] / 2 / math.tan(half)
         return cls(size_wh, f, f, (size_wh[0] - 1) / 2, (size_wh[1] - 1) / 2)
 
+    @property
+    def has_axis(self) -> bool:
+        return True
+
     def matrix(self) -> Floats:
         """The 3 x 3 camera matrix."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
@@ -178,7 +213,7 @@ class PinholeCamera:
     def project(self, xyz_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         x, y, z = np.asarray(xyz_m, np.float64).T
         seen = z > 0
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             a, b = x / z, y / z
             if any(self.distortion):
                 seen = seen & (a * a + b * b < self.valid_radius() ** 2)
@@ -192,16 +227,13 @@ class PinholeCamera:
         return _unit(np.stack([a, b, np.ones_like(a)], -1))
 
     def valid_radius(self) -> float:
-        """The largest tan(angle to the axis) up to which the distorted radius grows."""
-        if not any(self.distortion):
-            return math.inf
-        r = np.linspace(0, 10, 20_001)[1:]
-        falling = np.flatnonzero(np.diff(r * self._radial(r * r), prepend=0.0) <= 0)
-        return (
-            float(r[falling[0] - 1])
-            if falling.size and falling[0]
-            else (math.inf if not falling.size else 0.0)
-        )
+        """The tan(angle to the axis) up to which the distorted radius grows (tangential part left out)."""
+        k1, k2, _, _, k3, k4, k5, k6 = self._coefficients()
+        # In s = r^2 the radius is r N / D; its derivative has the sign of N D + 2 s (N' D - N D').
+        N, D = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
+        power = np.arange(4.0)
+        growth = np.convolve(N, D) + 2 * (np.convolve(power * N, D) - np.convolve(N, power * D))
+        return math.sqrt(_least_root(np.asarray(growth, np.float64), D))
 
     def _coefficients(self) -> tuple[float, ...]:
         return (*self.distortion, *([0.0] * (8 - len(self.distortion))))
@@ -214,17 +246,20 @@ class PinholeCamera:
         _, _, p1, p2, *_ = self._coefficients()
         r2 = a * a + b * b
         k = self._radial(r2)
-        return (
-            a * k + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-            b * k + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
-        )
+        across = a * k + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        return across, b * k + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
 
     def _undistort(self, a0: Floats, b0: Floats) -> tuple[Floats, Floats]:
-        """Newton's method, the Jacobian from differences; NaN where it does not arrive."""
-        a, b, h = a0.copy(), b0.copy(), 1e-6
-        limit = min(self.valid_radius(), 1e3)
+        """Bisection without the tangential part, then Newton's method, the Jacobian from differences.
+
+        NaN where that does not arrive: no direction falls there.
+        """
+        limit, r0, h = min(self.valid_radius(), 1e3), np.hypot(a0, b0), 1e-6
+        r = _inverse(lambda at: at * self._radial(at * at), r0, limit, 30)
+        scale = np.divide(r, r0, out=np.ones_like(r), where=r0 > 0)
+        a, b = scale * a0, scale * b0
         with np.errstate(all="ignore"):
-            for _ in range(30):
+            for _ in range(12):
                 fa, fb = self._distort(a, b)
                 ra, rb = fa - a0, fb - b0
                 (pa, pb), (ma, mb) = self._distort(a + h, b), self._distort(a - h, b)
@@ -235,7 +270,7 @@ class PinholeCamera:
                 shrink = np.minimum(1, limit / np.maximum(np.hypot(a, b), 1e-12))
                 a, b = a * shrink, b * shrink
             fa, fb = self._distort(a, b)
-            arrived = np.hypot(fa - a0, fb - b0) < 1e-9
+            arrived = np.hypot(fa - a0, fb - b0) < 1e-9 * np.maximum(1, r0)
         return np.where(arrived, a, np.nan), np.where(arrived, b, np.nan)
 
 
@@ -254,14 +289,7 @@ class FisheyeCamera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        checked_size(self.size_wh)
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(map(math.isfinite, numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise UsageError(
-                f"a camera's focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}"
-            )
-        if len(self.distortion) not in (0, 4):
-            raise UsageError(f"{len(self.distortion)} fisheye coefficients", hint="none or 4")
+        _check_intrinsics(self, (0, 4), "fisheye")
 
     @classmethod
     def of_fov(cls, size_wh: tuple[int, int], fov_deg: float) -> FisheyeCamera:
@@ -272,7 +300,9 @@ class FisheyeCamera:
 
     @property
     def has_axis(self) -> bool:
-        """Whether all of the picture looks forward (less than 90 degrees off the axis in its corners)."""
+        """Whether all that it sees is less than 90 degrees off the axis, in the picture's corners too."""
+        if self.valid_angle() <= np.pi / 2:
+            return True
         w, h = self.size_wh
         corner = np.hypot(
             max(self.cx + 0.5, w - 0.5 - self.cx) / self.fx, max(self.cy + 0.5, h - 0.5 - self.cy) / self.fy
@@ -281,9 +311,8 @@ class FisheyeCamera:
 
     def valid_angle(self) -> float:
         """The largest angle to the axis, at most pi, up to which the radius grows."""
-        t = np.linspace(0, np.pi, 20_001)[1:]
-        falling = np.flatnonzero(np.diff(self._radius(t), prepend=0.0) <= 0)
-        return float(t[falling[0] - 1]) if falling.size else math.pi
+        k1, k2, k3, k4 = self.distortion or (0.0, 0.0, 0.0, 0.0)
+        return min(math.pi, math.sqrt(_least_root(np.array([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4]))))
 
     def project(self, xyz_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         x, y, z = np.asarray(xyz_m, np.float64).T
@@ -297,13 +326,8 @@ class FisheyeCamera:
         u, v = np.asarray(uv, np.float64).T
         a, b = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         r, top = np.hypot(a, b), self.valid_angle()
-        low, high = np.zeros_like(r), np.full_like(r, top)
-        for _ in range(60):  # bisection: the radius grows all the way to `top`
-            middle = (low + high) / 2
-            below = self._radius(middle) < r
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        t = np.where(r <= self._radius(np.array(top)), (low + high) / 2, np.nan)
-        scale = np.divide(np.sin(t), r, out=np.ones_like(r), where=r > 0)
+        t = np.where(r <= self._radius(np.array(top)), _inverse(self._radius, r, top, 60), np.nan)
+        scale = np.divide(np.sin(t), r, out=np.ones_like(r), where=r != 0)
         return np.stack([scale * a, scale * b, np.cos(t)], -1)
 
     def _radius(self, t: Floats) -> Floats:
@@ -313,72 +337,65 @@ class FisheyeCamera:
 
 
 @dataclass(frozen=True, slots=True)
-class CylindricalCamera:
-    """Columns are even steps of azimuth, rows even steps of height on a cylinder of radius 1 around y."""
-
+class _AllRound:
     size_wh: tuple[int, int]
     fov_deg: float
-    has_axis: ClassVar[bool] = False
+
+    @property
+    def has_axis(self) -> bool:
+        return False
 
     def __post_init__(self) -> None:
         checked_size(self.size_wh)
-        checked_fov(self.fov_deg, 360.0001, "cylindrical")
+        what = type(self).__name__.removesuffix("Camera").lower()
+        checked_fov(self.fov_deg, 360, what, inclusive=True)
 
     @property
     def f(self) -> float:
-        """Pixels a radian, and pixels a unit of height."""
+        """Pixels a radian of azimuth; down, pixels a unit of what the model's rows are even steps of."""
         return self.size_wh[0] / math.radians(self.fov_deg)
+
+    def _pixels(self, azimuth: Floats, down: Floats) -> Floats:
+        w, h = self.size_wh
+        u, v = self.f * azimuth + (w - 1) / 2, self.f * down + (h - 1) / 2
+        if self.fov_deg >= 360:  # +180 degrees is the left edge, as -180 is, whatever rounding does
+            u = np.maximum(np.where(u >= w - 0.5, u - w, u), -0.5)
+        return np.stack([u, v], -1)
+
+    def _off_centre(self, uv: Floats) -> tuple[Floats, Floats]:
+        u, v = np.asarray(uv, np.float64).T
+        return (u - (self.size_wh[0] - 1) / 2) / self.f, (v - (self.size_wh[1] - 1) / 2) / self.f
+
+
+@dataclass(frozen=True, slots=True)
+class CylindricalCamera(_AllRound):
+    """Columns are even steps of azimuth, rows even steps of height on a cylinder of radius 1 around y."""
 
     def project(self, xyz_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         x, y, z = np.asarray(xyz_m, np.float64).T
         away = np.hypot(x, z)
-        height = np.divide(y, away, out=np.full_like(y, np.nan), where=away > 0)
-        return _around(self, np.arctan2(x, z), height), away > 0
+        with np.errstate(over="ignore"):
+            height = np.divide(y, away, out=np.full_like(y, np.nan), where=away > 0)
+        return self._pixels(np.arctan2(x, z), height), away > 0
 
     def unproject(self, uv: Floats) -> Floats:
-        azimuth, height = _off_centre(self, uv)
+        azimuth, height = self._off_centre(uv)
         return _unit(np.stack([np.sin(azimuth), height, np.cos(azimuth)], -1))
 
 
 @dataclass(frozen=True, slots=True)
-class SphericalCamera:
+class SphericalCamera(_AllRound):
     """Columns are even steps of azimuth, rows even steps of elevation (equirectangular)."""
-
-    size_wh: tuple[int, int]
-    fov_deg: float
-    has_axis: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        checked_size(self.size_wh)
-        checked_fov(self.fov_deg, 360.0001, "spherical")
-
-    @property
-    def f(self) -> float:
-        """Pixels a radian, both ways."""
-        return self.size_wh[0] / math.radians(self.fov_deg)
 
     def project(self, xyz_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         x, y, z = np.asarray(xyz_m, np.float64).T
         away = np.hypot(x, z)
-        return _around(self, np.arctan2(x, z), np.arctan2(y, away)), (away > 0) | (y != 0)
+        return self._pixels(np.arctan2(x, z), np.arctan2(y, away)), np.hypot(away, y) > 0
 
     def unproject(self, uv: Floats) -> Floats:
-        azimuth, down = _off_centre(self, uv)
+        azimuth, down = self._off_centre(uv)
         directions = [np.cos(down) * np.sin(azimuth), np.sin(down), np.cos(down) * np.cos(azimuth)]
         return np.where(np.abs(down)[:, None] <= np.pi / 2, np.stack(directions, -1), np.nan)
-
-
-def _around(camera: CylindricalCamera | SphericalCamera, azimuth: Floats, down: Floats) -> Floats:
-    w, h = camera.size_wh
-    u, v = camera.f * azimuth + (w - 1) / 2, camera.f * down + (h - 1) / 2
-    if camera.fov_deg >= 360:  # +180 degrees is the left edge, as -180 is
-        u = np.where(u >= w - 0.5, u - w, u)
-    return np.stack([u, v], -1)
-
-
-def _off_centre(camera: CylindricalCamera | SphericalCamera, uv: Floats) -> tuple[Floats, Floats]:
-    u, v = np.asarray(uv, np.float64).T
-    return (u - (camera.size_wh[0] - 1) / 2) / camera.f, (v - (camera.size_wh[1] - 1) / 2) / camera.f
 
 
 def _unit(xyz: Floats) -> Floats:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from fusion.lidar.lane import DepthLane
 from fusion.pipeline import Fuser
 
+DEPTH_LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "scipy")
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "simplejpeg", "fpng", "isal")
 
 
@@ -31,7 +35,7 @@ def describe_run(fuser: Fuser) -> dict[str, Any]:
         "inputs": {
             "pairs": len(fuser),
             "unmatched": len(fuser.pairs.pairing.unmatched),
-            "names_sha256": _names_digest(fuser),
+            "names_sha256": _digest("\0".join(fuser.pairs.stems(index)) for index in range(len(fuser))),
         },
         "config": _plain(config),
         "registration": _registration(fuser),
@@ -39,9 +43,28 @@ def describe_run(fuser: Fuser) -> dict[str, Any]:
     }
 
 
-def _versions() -> dict[str, str]:
+def describe_depth(lane: DepthLane, stems: Sequence[str], given: Mapping[str, bool]) -> dict[str, Any]:
+    """The same of a run over clouds: versions, inputs, effective configuration, the camera as it is.
+
+    `given` says what else the run looks at; the rig is known by its numbers.
+    """
+    config = lane.config.model_dump(exclude_none=True)
+    del config["strict"]
+    config["camera"].pop("rig", None)
+    camera = {"kind": type(lane.camera).__name__, **asdict(lane.camera)}  # type: ignore[call-overload]
+    return {
+        "versions": _versions(DEPTH_LIBRARIES),
+        "inputs": {"frames": len(stems), "names_sha256": _digest(stems), **given},
+        "config": _plain(config),
+        "camera": _plain(camera),
+        "T_cam_lidar": lane.T_cam_lidar.tolist(),
+        "value": lane.value,
+    }
+
+
+def _versions(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
     own = {"fusion": version("fusionprep"), "python": platform.python_version()}
-    return {**own, **{name: _version(name) for name in LIBRARIES}}
+    return {**own, **{name: _version(name) for name in libraries}}
 
 
 def _version(name: str) -> str:
@@ -51,10 +74,10 @@ def _version(name: str) -> str:
         return "none"
 
 
-def _names_digest(fuser: Fuser) -> str:
+def _digest(names: Iterable[str]) -> str:
     digest = hashlib.sha256()
-    for index in range(len(fuser)):
-        digest.update("\0".join(fuser.pairs.stems(index)).encode("utf-8", "surrogateescape") + b"\n")
+    for name in names:
+        digest.update(name.encode("utf-8", "surrogateescape") + b"\n")
     return digest.hexdigest()
 
 

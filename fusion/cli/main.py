@@ -26,6 +26,21 @@ BLEND_EXAMPLES = """Examples:
   fusion blend MFNet/images/ -o out/ --preset thesis
   fusion blend MSRS/ -o out/ --dataset msrs"""
 
+DEPTH_HELP = (
+    "Turn LiDAR clouds into dense depth maps.\n\n"
+    "A cloud is cleaned, projected onto a virtual 120-degree camera (or a real one of a rig), freed of"
+    " points that the camera cannot see, and the gaps between them are filled. OUT gets depth/ (uint16,"
+    " metres x 256), support/, sparse/, picture/, frames.csv and run.toml. The same command run again keeps"
+    " finished maps."
+)
+DEPTH_EXAMPLES = """Examples:
+  fusion depth scans/ -o out/
+  fusion depth map.pcd -o out/ --position 12 0.5 1.4 --look 30 0 0
+  fusion depth scans/ -o out/ --preset thesis
+  fusion depth 000000.bin -o out/ --rig calib/000000.txt --overlay image_2/000000.png --show 1 60
+  fusion depth --sparse velodyne_raw/ -o out/ --score groundtruth/
+  fusion depth --sparse sparse/ --guide rgb/ --method guided -o out/"""
+
 app = App(
     name="fusion",
     help="Fused RGB-thermal frames for trackers. Start with: fusion blend RGB FIR -o OUT --preview",
@@ -35,6 +50,7 @@ app = App(
     suppress_keyboard_interrupt=False,  # ours says how to go on
 )
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
+app.command("fusion.cli.depth:depth", name="depth", help=DEPTH_HELP, help_epilogue=DEPTH_EXAMPLES)
 datasets = App(name="datasets", help="List and show the data sets whose layout is known.")
 datasets.command("fusion.cli.datasets:list_datasets", name="list", help="List the known data sets.")
 datasets.command(

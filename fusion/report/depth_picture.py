@@ -15,7 +15,7 @@ FONT_PX, LEAST_HEIGHT = 14, 120
 
 
 def coloured(value_m: NDArray[np.float32], colormap: str, show_m: tuple[float, float]) -> NDArray[np.uint8]:
-    """BGR of values (any shape, metres): `show_m` spans the whole map, beyond it the end colours; 0 is grey."""
+    """BGR of values (metres): `show_m` spans the whole map, beyond it the end colours; 0 is grey."""
     lo, hi = show_m
     index = np.floor(np.clip((value_m - np.float32(lo)) / np.float32(hi - lo), 0, 1) * 255 + np.float32(0.5))
     bgr = colormap_bgr(colormap)[index.astype(np.uint8)]

@@ -31,7 +31,7 @@ def plan_lines(fuser: Fuser) -> list[str]:
         rows.append(("outside", crop if config.warp.outside == "crop" else config.warp.outside))
     colours = f"colour map {config.thermal.colormap}, {config.blend.method}, alpha {config.blend.alpha:g}"
     rows.append(("preset", f"{config.preset}: {colours}"))
-    return [*_table(rows), *(f"note: {note}" for note in pairing.notes)]
+    return [*table(rows), *(f"note: {note}" for note in pairing.notes)]
 
 
 def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
@@ -49,7 +49,7 @@ def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
         rows.append(("time apart", f"median {dt.dt_median_ms:.3f} ms, largest {dt.dt_max_ms:.3f} ms"))
     rows += [(flag, f"{count} of {done} frames") for flag, count in sorted(report.flags.items())]
     rows.append(("written to", str(out)))
-    return _table(rows)
+    return table(rows)
 
 
 def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
@@ -86,6 +86,7 @@ def _span(span: tuple[float, float] | None) -> str:
     return f"{span[0]:.6g}" if span[0] == span[1] else f"{span[0]:.6g}…{span[1]:.6g}"
 
 
-def _table(rows: list[tuple[str, str]]) -> list[str]:
+def table(rows: list[tuple[str, str]]) -> list[str]:
+    """Two columns of text, the first as wide as its longest word."""
     width = max(len(label) for label, _ in rows)
     return [f"{label:<{width}}  {text}" for label, text in rows]

@@ -105,7 +105,7 @@ class DepthSink(RunFolder[DepthRow]):
             "support": encode_png(np.where(frame.dense.support, np.uint8(255), np.uint8(0))),
             "sparse": _npz(frame.sparse),
             "picture": encode_png(picture_bgr),
-            "depth": depth_png(frame.dense.value_m),
+            "depth": encode_png(quantised(frame.dense.value_m)),
         }
         if overlay_bgr is not None:
             data["overlay"] = encode_png(overlay_bgr)
@@ -124,10 +124,10 @@ class DepthSink(RunFolder[DepthRow]):
         return self.out / kind / f"{inside(stem)}{KINDS[kind]}"
 
 
-def depth_png(value_m: NDArray[np.float32]) -> bytes:
-    """H x W metres as uint16, metres x 256 rounded half up, 0 = none, least 1 where there is a value."""
+def quantised(value_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Metres as metres x 256, rounded half up: 0 = none, at least 1 where there is a value."""
     scaled = np.floor(np.minimum(value_m, np.float32(65535 / PER_METRE)) * PER_METRE + 0.5)
-    return encode_png(np.where(value_m > 0, np.maximum(scaled, 1), 0).astype(np.uint16))
+    return np.where(value_m > 0, np.maximum(scaled, 1), 0).astype(np.uint16)
 
 
 def _npz(sparse: SparseDepth) -> bytes:
