@@ -13,14 +13,16 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import cv2
 
 from fusion.errors import FrameError, InputError
-from fusion.pipeline import Fuser
-from fusion.sinks.folder import FolderSink
 from fusion.sinks.index import IndexRow, Row
+
+if TYPE_CHECKING:
+    from fusion.pipeline import Fuser
+    from fusion.sinks.folder import FolderSink
 
 IN_FLIGHT_PER_WORKER = 3
 T = TypeVar("T")

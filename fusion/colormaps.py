@@ -1,7 +1,7 @@
 """Colour maps: 256-entry tables from an 8-bit index to BGR.
 
-A bare name is looked for among our own maps first, then matplotlib's, then OpenCV's: `hsv` is
-MATLAB's, `jet` is matplotlib's, `parula` is OpenCV's. `mpl:NAME` and `cv:NAME` ask one library.
+A bare name is looked for among our own maps first, then matplotlib's, then OpenCV's: `hsv` and `jet`
+are MATLAB's, `inferno` is matplotlib's, `parula` is OpenCV's. `mpl:NAME` and `cv:NAME` ask one library.
 matplotlib is imported only when a name leads there.
 """
 
@@ -49,11 +49,18 @@ def _hsv_cold_hot() -> NDArray[np.uint8]:
     return _hue_table(4 * np.arange(255, -1, -1, dtype=np.int64), 255)
 
 
+def _jet() -> NDArray[np.uint8]:
+    """MATLAB's jet(256): three equal trapezia with sides of 64 entries, blue, green, red, 64 apart."""
+    k = np.arange(256, dtype=np.int64)
+    sixtyfourths = [np.clip(np.minimum(k + 33 - shift, 159 - k + shift), 0, 64) for shift in (0, 64, 128)]
+    return ((2 * 255 * np.stack(sixtyfourths, axis=1) + 64) // (2 * 64)).astype(np.uint8)
+
+
 def _grey() -> NDArray[np.uint8]:
     return np.repeat(_ENTRIES[:, None], 3, axis=1)
 
 
-_OURS = {"hsv-cold-hot": _hsv_cold_hot, "hsv": _hsv, "grey": _grey}
+_OURS = {"hsv-cold-hot": _hsv_cold_hot, "hsv": _hsv, "jet": _jet, "grey": _grey}
 _OPENCV: dict[str, int] = {
     name.removeprefix("COLORMAP_").lower(): getattr(cv2, name)
     for name in sorted(dir(cv2))
@@ -95,7 +102,7 @@ def colormap_bgr(name: str) -> NDArray[np.uint8]:
     """The colour map `name` as a read-only 256 x 3 uint8 table in BGR order.
 
     Ours: `hsv` (MATLAB's hsv(256), METHOD section 1; both ends are red), `hsv-cold-hot` (its blue to
-    red part, no cycle), `grey`. Then every matplotlib map (`inferno`, or `mpl:inferno`) and every
+    red part, no cycle), `jet` (MATLAB's jet(256)), `grey`. Then every matplotlib map (`inferno`, or `mpl:inferno`) and every
     OpenCV map (`cv:jet`). A bare name is looked for in that order: ours, matplotlib, OpenCV.
     matplotlib's colours are those it shows 8-bit data in; its maps with fewer or more entries are
     brought to 256 as matplotlib does. Raises `UsageError` with the nearest names for an unknown one.

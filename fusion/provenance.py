@@ -8,10 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fusion.lidar.lane import DepthLane
-from fusion.pipeline import Fuser
+if TYPE_CHECKING:
+    from fusion.lidar.lane import DepthLane
+    from fusion.pipeline import Fuser
 
 DEPTH_LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "scipy")
 LIBRARIES = ("numpy", "opencv-contrib-python-headless", "numba", "simplejpeg", "fpng", "isal")

@@ -98,6 +98,31 @@ def _as_matplotlib_shows(name: str) -> NDArray[np.uint8]:
     return rgba[:, [2, 1, 0]]
 
 
+def test_jet_is_matlabs_by_its_definition() -> None:
+    """The trapezium u of m/4 rising, m/4 - 1 flat and m/4 falling entries, laid out three times (m = 256)."""
+    u = [
+        *(Fraction(k, 64) for k in range(1, 65)),
+        *[Fraction(1)] * 63,
+        *(Fraction(k, 64) for k in range(64, 0, -1)),
+    ]
+    bgr = [[Fraction(0)] * 3 for _ in range(256)]
+    for channel, first in (
+        (1, 32),
+        (2, 96),
+        (0, -32),
+    ):  # green from entry 33 of 256, red a quarter later, blue before
+        for k, value in enumerate(u):
+            if 0 <= first + k < 256:
+                bgr[first + k][channel] = value
+    expected = [[math.floor(255 * value + Fraction(1, 2)) for value in row] for row in bgr]
+    assert colormap_bgr("jet").tolist() == expected
+
+
+def test_jet_is_close_to_the_librarys() -> None:
+    """OpenCV's is the same map drawn with other end points: a few grey levels apart."""
+    assert np.abs(colormap_bgr("jet").astype(int) - colormap_bgr("cv:jet")).max() <= 4
+
+
 def test_every_matplotlib_map_is_what_matplotlib_shows() -> None:
     names = list(matplotlib.colormaps)
     assert len(names) > 100
@@ -115,17 +140,18 @@ def test_a_map_of_ten_colours_uses_all_ten_evenly() -> None:
 def test_bare_names_prefer_ours_then_matplotlib_then_opencv() -> None:
     assert not np.array_equal(colormap_bgr("hsv"), colormap_bgr("mpl:hsv"))
     assert not np.array_equal(colormap_bgr("hsv"), colormap_bgr("cv:hsv"))
-    np.testing.assert_array_equal(colormap_bgr("jet"), colormap_bgr("mpl:jet"))
-    assert not np.array_equal(colormap_bgr("jet"), colormap_bgr("cv:jet"))
+    assert not np.array_equal(colormap_bgr("jet"), colormap_bgr("mpl:jet"))
+    np.testing.assert_array_equal(colormap_bgr("inferno"), colormap_bgr("mpl:inferno"))
+    assert not np.array_equal(colormap_bgr("inferno"), colormap_bgr("cv:inferno"))
     assert "parula" not in matplotlib.colormaps
     np.testing.assert_array_equal(colormap_bgr("parula"), colormap_bgr("cv:parula"))
 
 
 def test_names_are_unique_complete_and_accepted() -> None:
     names = colormap_names()
-    assert len(names) == len(set(names)) == 3 + len(list(matplotlib.colormaps)) + len(CV_MAPS)
+    assert len(names) == len(set(names)) == 4 + len(list(matplotlib.colormaps)) + len(CV_MAPS)
     assert names[0] == "hsv-cold-hot"
-    assert {"hsv", "grey", "mpl:hsv", "mpl:grey", "inferno", "cv:jet"} <= set(names)
+    assert {"hsv", "jet", "grey", "mpl:hsv", "mpl:jet", "mpl:grey", "inferno", "cv:jet"} <= set(names)
     assert all(colormap_bgr(name).shape == (256, 3) for name in names)
 
 

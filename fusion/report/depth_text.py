@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fusion.lidar.lane import DepthLane, likely_cause
 from fusion.lidar.score import Score, mean_score
-from fusion.report.text import LOUD_SKIPS, table
+from fusion.report.table import LOUD_SKIPS, table
 from fusion.sinks.depth import DepthRow
 
 STEPS = {

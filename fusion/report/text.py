@@ -6,9 +6,8 @@ from pathlib import Path
 
 from fusion.batch import RunReport
 from fusion.pipeline import Fuser
+from fusion.report.table import LOUD_SKIPS, table
 from fusion.thermal import clip_advice
-
-LOUD_SKIPS = 10
 
 
 def plan_lines(fuser: Fuser) -> list[str]:
@@ -84,9 +83,3 @@ def _span(span: tuple[float, float] | None) -> str:
     if span is None:
         return "-"
     return f"{span[0]:.6g}" if span[0] == span[1] else f"{span[0]:.6g}…{span[1]:.6g}"
-
-
-def table(rows: list[tuple[str, str]]) -> list[str]:
-    """Two columns of text, the first as wide as its longest word."""
-    width = max(len(label) for label, _ in rows)
-    return [f"{label:<{width}}  {text}" for label, text in rows]
