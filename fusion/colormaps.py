@@ -102,8 +102,9 @@ def colormap_bgr(name: str) -> NDArray[np.uint8]:
     """The colour map `name` as a read-only 256 x 3 uint8 table in BGR order.
 
     Ours: `hsv` (MATLAB's hsv(256), METHOD section 1; both ends are red), `hsv-cold-hot` (its blue to
-    red part, no cycle), `jet` (MATLAB's jet(256)), `grey`. Then every matplotlib map (`inferno`, or `mpl:inferno`) and every
-    OpenCV map (`cv:jet`). A bare name is looked for in that order: ours, matplotlib, OpenCV.
+    red part, no cycle), `jet` (MATLAB's jet(256)), `grey`. Then every matplotlib map (`inferno`, or
+    `mpl:inferno`) and every OpenCV map (`cv:jet`). A bare name is looked for in that order: ours,
+    matplotlib, OpenCV.
     matplotlib's colours are those it shows 8-bit data in; its maps with fewer or more entries are
     brought to 256 as matplotlib does. Raises `UsageError` with the nearest names for an unknown one.
     """
