@@ -43,6 +43,8 @@ SAME_FLOOR = {
     ("registration", "warp"),
     ("manifest", "pairing"),
     ("pairing", "sources"),
+    ("clouds", "sources"),
+    ("clouds", "pairing"),
 }
 
 
