@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
+from fusion.codecs import MAX_PIXELS
 from fusion.errors import UsageError
 from fusion.geometry import (
     T_CAM_LIDAR,
@@ -27,6 +28,7 @@ from fusion.lidar.project import FARTHEST_M
 from fusion.settings import Group, first_problem, merged, read_settings
 
 FORMAT = "fusion-depth/1"
+FARTHEST_SHOWN_M = 1e6  # of the colours: beyond it float32 no longer tells them apart
 PATHS = (("camera", "rig"),)
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
@@ -50,7 +52,7 @@ class CloudConfig(Group):
     range_m: tuple[float, float] | None = None
     box_m: tuple[float, float, float, float, float, float] | None = None
     voxel_m: Positive | None = None
-    outliers: tuple[Annotated[int, Field(ge=1, le=1000)], Positive] | None = None
+    outliers: tuple[Annotated[int, Field(ge=2, le=1000)], Positive] | None = None
 
 
 class CameraConfig(Group):
@@ -128,32 +130,54 @@ def load_depth_config(path: Path | None, overrides: Mapping[str, Any]) -> DepthC
     Paths inside the file count from the file's own folder. Raises `UsageError` naming the key.
     """
     settings = {} if path is None else read_settings(path, FORMAT, PATHS)
+    for group in ("cloud", "camera", "samples", "dense", "picture"):  # else an option would replace what it is
+        if not isinstance(settings.get(group, {}), Mapping):
+            raise UsageError(f"{group} is no table", where=str(path), hint=f"write [{group}], then its keys")
     return _validated(merged(settings, overrides), where="options" if path is None else str(path))
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> DepthConfig:
     preset = settings.get("preset", "auto")
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise UsageError(f"unknown preset {preset!r}", where=where, hint=f"one of: {', '.join(PRESETS)}")
     try:
         config = DepthConfig.model_validate(merged(PRESETS[preset], settings))
     except ValidationError as error:
         raise UsageError(first_problem(error), where=where) from None
-    _check_pairs(config, where)
+    _check_spans(config, where)
+    _check_camera(config.camera, where)
     return config
 
 
-def _check_pairs(config: DepthConfig, where: str) -> None:
-    for name, pair in (
-        ("cloud.range_m", config.cloud.range_m),
-        ("samples.limits_m", config.samples.limits_m),
-        ("picture.show_m", config.picture.show_m),
+def _check_spans(config: DepthConfig, where: str) -> None:
+    for name, span, most in (
+        ("cloud.range_m", config.cloud.range_m, math.inf),
+        ("samples.limits_m", config.samples.limits_m, FARTHEST_M),
+        ("picture.show_m", config.picture.show_m, FARTHEST_SHOWN_M),
     ):
-        if pair is not None and not 0 <= pair[0] < pair[1]:
-            raise UsageError(
-                f"{name}: {pair[0]:g} to {pair[1]:g} is no range", where=where, hint="LEAST MOST, metres"
-            )
-    camera = config.camera
+        if span is not None and not 0 <= span[0] < span[1] <= most:
+            hint = "LEAST MOST, metres" + (f", at most {math.floor(most * 1000) / 1000:.10g}" if most < math.inf else "")
+            raise UsageError(f"{name}: {span[0]:g} to {span[1]:g} is no range", where=where, hint=hint)
+    box = config.cloud.box_m
+    if box is not None and not all(lo < hi for lo, hi in zip(box[:3], box[3:], strict=True)):
+        corners = f"({box[0]:g}, {box[1]:g}, {box[2]:g}) to ({box[3]:g}, {box[4]:g}, {box[5]:g})"
+        hint = "X0 Y0 Z0 X1 Y1 Z1, the lower corner first"
+        raise UsageError(f"cloud.box_m: {corners} is no box", where=where, hint=hint)
+
+
+def _check_camera(camera: CameraConfig, where: str) -> None:
+    w, h = camera.size_wh
+    if w * h > MAX_PIXELS:
+        hint = f"at most {MAX_PIXELS} pixels"
+        raise UsageError(f"camera.size_wh: {w}x{h} is too large a picture", where=where, hint=hint)
+    virtual = sorted(camera.model_fields_set & {"model", "fov_deg", "size_wh"})
+    if camera.rig is not None and virtual:
+        hint = "they are for virtual cameras; leave them out"
+        raise UsageError(f"camera.{virtual[0]} beside a rig, which says it", where=where, hint=hint)
+    if camera.rig is None and "sensor" in camera.model_fields_set:
+        raise UsageError(
+            "camera.sensor without a rig", where=where, hint="give the rig that it is a camera of"
+        )
     placed = camera.position_m is not None or camera.look_deg is not None
     if sum((placed, camera.T_cam_lidar is not None, camera.rig is not None)) > 1:
         hint = "give one of rig, T_cam_lidar, or position_m with look_deg"

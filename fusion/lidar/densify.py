@@ -60,7 +60,7 @@ def _scattered(method: Literal["linear", "natural", "nearest"]) -> Fill:
 
 
 def _natural_discrete(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
-    from fusion.lidar.scattered import natural_discrete
+    from fusion.lidar.discrete import natural_discrete
 
     inverse = natural_discrete(sparse.u, sparse.v, 1 / sparse.value_m, sparse.size_wh, threads=demand.threads)
     return 1 / inverse
@@ -105,6 +105,13 @@ def densifier(name: str) -> Fill:
     return lookup(DENSIFIERS, "fusion.densifiers", name, "method")
 
 
+def check_beyond(method: str, extrapolate: Extrapolate) -> None:
+    """Refuse, before any work, extrapolation that `method` has no slope for. Raises `UsageError`."""
+    if extrapolate == "linear" and method in DENSIFIERS and method not in LINEAR_BEYOND:
+        hint = f"{', '.join(sorted(LINEAR_BEYOND))} can; or --extrapolate nearest"
+        raise UsageError(f"{method} cannot extrapolate linearly", where="--extrapolate", hint=hint)
+
+
 def densify(sparse: SparseDepth, method: str = "plane", demand: Demand | None = None) -> DenseDepth:
     """A value for every pixel near samples, by `method` (a row of `DENSIFIERS`).
 
@@ -115,9 +122,7 @@ def densify(sparse: SparseDepth, method: str = "plane", demand: Demand | None = 
     """
     demand = demand or Demand()
     fill = densifier(method)
-    if demand.extrapolate == "linear" and method in DENSIFIERS and method not in LINEAR_BEYOND:
-        hint = f"{', '.join(sorted(LINEAR_BEYOND))} can; or --extrapolate nearest"
-        raise UsageError(f"{method} cannot extrapolate linearly", where="--extrapolate", hint=hint)
+    check_beyond(method, demand.extrapolate)
     if not len(sparse):
         raise FrameError("no sample to fill in from")
     values = np.nan_to_num(fill(sparse, demand), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
@@ -144,6 +149,7 @@ def _hull(sparse: SparseDepth) -> NDArray[np.bool_]:
     """The pixels inside the samples' convex hull, those of the samples themselves included."""
     w, h = sparse.size_wh
     corners = cv2.convexHull(np.stack([sparse.u, sparse.v], -1).astype(np.float32))
+    inside = np.clip(np.rint(corners), 0, (w - 1, h - 1))  # float32 may round onto the border and beyond
     mask = np.zeros((h, w), np.uint8)
-    cv2.fillConvexPoly(mask, np.rint(corners).astype(np.int32), 1)
+    cv2.fillConvexPoly(mask, inside.astype(np.int32), 1)
     return mask > 0

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.clouds.filters import crop_box, crop_range, statistical_outliers, voxel
-from fusion.errors import FrameError
+from fusion.errors import FrameError, UsageError
 from fusion.frames import PointCloud
 from fusion.geometry import Camera, Floats, transform
 from fusion.lidar.config import CloudConfig, DepthConfig
-from fusion.lidar.densify import Demand, densifier, densify
+from fusion.lidar.densify import Demand, check_beyond, densifier, densify
 from fusion.lidar.project import check_value, from_image, project
 from fusion.lidar.rings import rings_of
 from fusion.lidar.sparse import DenseDepth, SparseDepth, Value
@@ -60,6 +60,7 @@ class DepthLane:
         self.value: Value = chosen if chosen != "auto" else "depth" if self.camera.has_axis else "range"
         check_value(self.camera, self.value)
         densifier(self.config.dense.method)
+        check_beyond(self.config.dense.method, self.config.dense.extrapolate)
 
     def of_cloud(
         self, cloud: PointCloud, *, guide_bgr: NDArray[np.uint8] | None = None, threads: int = 1
@@ -131,6 +132,9 @@ class DepthLane:
         dense = self.config.dense
         demand = Demand(dense.extrapolate, dense.max_gap_px, self.config.samples.limits_m, guide_bgr, threads)
         filled = densify(sparse, dense.method, demand)
+        if not filled.value_m.any():
+            hint = "more points, a larger --max-gap, or --extrapolate nearest"
+            raise FrameError(f"{len(sparse)} samples, and no pixel between them", where=stem, hint=hint)
         cause = likely_cause(sparse.counts)
         return DepthFrame(stem, sparse, filled, stamp_ns, dropped, ("few-points",) if cause else ())
 
@@ -142,7 +146,10 @@ def cleaned(cloud: PointCloud, config: CloudConfig) -> PointCloud:
     if config.box_m is not None:
         cloud = crop_box(cloud, config.box_m[:3], config.box_m[3:])
     if config.voxel_m is not None and len(cloud):
-        cloud = voxel(cloud, config.voxel_m)
+        try:
+            cloud = voxel(cloud, config.voxel_m)
+        except UsageError as error:  # the size is right; this cloud is too wide for it
+            raise FrameError(error.what, where=cloud.stem, hint=error.hint) from None
     if config.outliers is not None and len(cloud):
         cloud = statistical_outliers(cloud, *config.outliers)
     return cloud

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fusion.errors import UsageError
 from fusion.frames import PointCloud
 from fusion.geometry import T_CAM_LIDAR, Camera, Floats, PinholeCamera, checked_pose, transform
+from fusion.kernels import read_only
 from fusion.lidar.kernels import nearest_of_pixels, project_pinhole
 from fusion.lidar.sparse import SparseDepth, Value
 
@@ -62,16 +63,24 @@ def project(
 
 def check_value(camera: Camera, value: Value) -> None:
     """Refuse depth along an axis where pixels look sideways or back."""
+    if value not in ("depth", "range"):
+        raise ValueError(f"expected depth or range, got {value!r}")
     if value == "depth" and not camera.has_axis:
         hint = "use range: the distance to the camera's centre"
         raise UsageError("depth along the axis means nothing for a camera that looks all round", hint=hint)
 
 
 def z_buffer(sparse: SparseDepth) -> NDArray[np.float32]:
-    """The sparse picture: the least value of the samples that fall into each pixel, 0 where none does."""
+    """The sparse picture: the least value of the samples that fall into each pixel, 0 where none does.
+
+    Raises `ValueError` for samples outside the picture.
+    """
     w, h = sparse.size_wh
     image = np.zeros((h, w), np.float32)
-    nearest_of_pixels(sparse.u, sparse.v, sparse.value_m, image)
+    samples = (sparse.u, sparse.v, sparse.value_m)
+    outside = nearest_of_pixels(*(read_only(np.ascontiguousarray(a)) for a in samples), image)
+    if outside:
+        raise ValueError(f"expected samples inside {w}x{h} pixels, got {outside} outside")
     return image
 
 
@@ -117,13 +126,15 @@ def _through_pinhole(
 ) -> Samples:
     n = len(xyz)
     u, v, values, index = np.empty(n), np.empty(n), np.empty(n, np.float32), np.empty(n, np.int64)
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    # One type for each argument, whatever was given: every other one would be compiled anew.
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    size = (int(camera.size_wh[0]), int(camera.size_wh[1]))
     limits = (float(limits_m[0]), float(limits_m[1]))
     kept = project_pinhole(
-        np.ascontiguousarray(xyz),
+        read_only(np.ascontiguousarray(xyz)),
         T,
         intrinsics,
-        camera.size_wh,
+        size,
         limits,
         use_range,
         first,

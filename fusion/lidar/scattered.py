@@ -1,14 +1,11 @@
 """Interpolation of scattered samples, as MATLAB's `scatteredInterpolant` does it (thesis 6.2, equation 6.2).
 
-`interpolate` fills an image, `ScatteredInterpolant` answers at any point, `natural_discrete` is a fast
-approximation of natural neighbours. Coordinates are pixels: u the column, v the row, (0, 0) the centre of the
-first pixel; they need not be whole and may lie outside the image.
+`interpolate` fills an image, `ScatteredInterpolant` answers at any point. Coordinates are pixels: u the
+column, v the row, (0, 0) the centre of the first pixel; they need not be whole and may lie outside the image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion.errors import FrameError
 from fusion.kernels import read_only
+from fusion.lidar.bands import in_bands
 
 Method = Literal["linear", "natural", "nearest"]
 Extrapolate = Literal["none", "nearest", "linear"]
@@ -94,7 +92,7 @@ class ScatteredInterpolant:
     ) -> None:
         if method not in get_args(Method) or extrapolate not in get_args(Extrapolate):
             raise ValueError(f"expected {Method} and {Extrapolate}, got {method!r} and {extrapolate!r}")
-        x, y, value = _checked_samples(u, v, values)
+        x, y, value = checked_samples(u, v, values)
         self.method, self.extrapolate = method, extrapolate
         self._x, self._y, self._value = _merged(x, y, value)
         self.merged, self.lost = x.size - self._x.size, 0
@@ -120,7 +118,7 @@ class ScatteredInterpolant:
         """As `interpolate`."""
         from fusion.lidar import scattered_kernels as kernels
 
-        width, height = _checked_size(size_wh)
+        width, height = checked_size(size_wh)
         inside = np.zeros((height, width), np.bool_)
         kernels.fill_convex(self._x[self._corner_hull], self._y[self._corner_hull], inside)
         if self._mesh is None or self.method == "nearest":
@@ -161,7 +159,7 @@ class ScatteredInterpolant:
         kernels.rasterise(mesh.corner, mesh.x, mesh.y, self._value, label, dense)
         if self.method == "natural":
             centre = _circumcentres(mesh)
-            _in_bands(
+            in_bands(
                 lambda a, b: kernels.sibson_rows(a, b, label, *mesh, self._value, centre, dense),
                 shape[0],
                 threads,
@@ -182,7 +180,7 @@ class ScatteredInterpolant:
         from fusion.lidar import scattered_kernels as kernels
 
         site = np.empty(shape, np.int32)
-        _in_bands(lambda a, b: kernels.nearest_rows(a, b, self._x, self._y, site), shape[0], threads)
+        in_bands(lambda a, b: kernels.nearest_rows(a, b, self._x, self._y, site), shape[0], threads)
         return self._value[site]
 
     def _nearest_at(self, xq: _Reals, yq: _Reals) -> _Reals:
@@ -209,80 +207,8 @@ class ScatteredInterpolant:
         return out
 
 
-def natural_discrete(
-    u: ArrayLike,
-    v: ArrayLike,
-    values: ArrayLike,
-    size_wh: tuple[int, int],
-    *,
-    step: int = 1,
-    coarse: int | None = 16,
-    threads: int = 1,
-) -> NDArray[np.float32]:
-    """Natural neighbours on a raster (Park et al. 2006), at each pixel of an image: H x W float32.
-
-    Samples (`u`, `v`, `values`: N each) are moved to the nearest cell of a raster of `step` x `step` pixels,
-    those outside to its border; several in a cell are averaged. Every cell spreads the value of its nearest
-    sample over all cells nearer to it than that sample; the result is the mean of what arrives, and a
-    sample's own cell keeps its value. With `step` > 1 cells are interpolated bilinearly. Cells `coarse` cells
-    or more from their sample, in gaps and outside the hull, spread in blocks: one for 2 x 2 cells, from
-    twice that distance on for 4 x 4, and so on; None spreads each.
-
-    The result lies between the samples' minimum and maximum, outside the hull as well. It is summed in fixed
-    point and does not depend on `threads`. Raises `FrameError` without samples, `ValueError` for lists of
-    unequal length, numbers that are not finite, and more than 8 million cells.
-    """
-    from fusion.lidar import scattered_kernels as kernels
-
-    width, height = _checked_size(size_wh)
-    if step < 1 or (coarse is not None and coarse < 4):
-        raise ValueError(f"expected step of at least 1 and coarse of at least 4, got {step} and {coarse}")
-    x, y, value = _checked_samples(u, v, values)
-    w, h = -(-width // step), -(-height // step)
-    column = np.clip(np.rint((x + 0.5) / step - 0.5), 0, w - 1).astype(np.int32)
-    row = np.clip(np.rint((y + 0.5) / step - 0.5), 0, h - 1).astype(np.int32)
-    total, count, nearest = np.zeros((h, w)), np.zeros((h, w), np.int32), np.empty((h, w), np.int32)
-    kernels.site_rows(column, row, value, total, count, nearest)
-    grey, bits, lowest, unit = _packed(total, count)
-    limit = 1 << 20 if coarse is None else coarse
-    bands = max(1, min(threads, h))
-    discs = np.zeros((bands, h, w + 1), np.int64)
-    edges = np.linspace(0, h, bands + 1).astype(int)
-    _in_threads(
-        [
-            lambda i=i: kernels.scatter_discs(edges[i], edges[i + 1], nearest, grey, _ROOT, limit, discs[i])
-            for i in range(bands)
-        ]
-    )
-    out = np.empty((h, w), np.float32)
-    _in_bands(
-        lambda a, b: kernels.gather_discs(a, b, discs, total, count, bits, lowest, unit, out), h, threads
-    )
-    if step == 1:
-        return out
-    import cv2
-
-    return cv2.resize(out, (w * step, h * step))[:height, :width].astype(np.float32)
-
-
-_ROOT = np.sqrt(np.arange(64 * 64)).astype(np.int32)
-
-
-def _packed(total: _Reals, count: NDArray[np.int32]) -> tuple[NDArray[np.int64], int, float, float]:
-    """Each site's value as a whole number of units, above `bits` bits that count it once."""
-    bits = (4 * count.size).bit_length()  # blocks overlap a little where their sizes change
-    if bits > 25:
-        raise ValueError(f"expected fewer than {1 << 23} cells, got {count.size}: take a larger step")
-    site = np.flatnonzero(count)
-    mean = total.reshape(-1)[site] / count.reshape(-1)[site]
-    lowest, highest = float(mean.min()), float(mean.max())
-    unit = (highest - lowest) / ((1 << min(24, 63 - 2 * bits)) - 1) or 1.0
-    grey = np.empty(count.shape, np.int64)
-    grey.reshape(-1)[site] = (np.rint((mean - lowest) / unit).astype(np.int64) << bits) + 1
-    return grey, bits, lowest, unit
-
-
-def _checked_samples(u: ArrayLike, v: ArrayLike, values: ArrayLike) -> tuple[_Reals, _Reals, _Reals]:
+def checked_samples(u: ArrayLike, v: ArrayLike, values: ArrayLike) -> tuple[_Reals, _Reals, _Reals]:
+    """Three lists of one length, float64 and finite; else `ValueError`. `FrameError` if they are empty."""
     x, y, value = (np.ascontiguousarray(a, np.float64) for a in (u, v, values))
     if x.ndim != 1 or x.shape != y.shape or x.shape != value.shape:
         raise ValueError(f"expected three lists of one length, got {x.shape}, {y.shape} and {value.shape}")
@@ -293,7 +219,8 @@ def _checked_samples(u: ArrayLike, v: ArrayLike, values: ArrayLike) -> tuple[_Re
     return x, y, value
 
 
-def _checked_size(size_wh: tuple[int, int]) -> tuple[int, int]:
+def checked_size(size_wh: tuple[int, int]) -> tuple[int, int]:
+    """A size of at least 1 x 1; else `ValueError`."""
     width, height = size_wh
     if width < 1 or height < 1:
         raise ValueError(f"expected a size of at least 1 x 1, got {size_wh}")
@@ -389,19 +316,3 @@ def _slopes(
 def _centres(mask: NDArray[np.bool_]) -> tuple[_Reals, _Reals]:
     rows, columns = np.nonzero(mask)
     return columns.astype(np.float64), rows.astype(np.float64)
-
-
-def _in_bands(work: Callable[[int, int], Any], rows: int, threads: int) -> None:
-    """`work(first, last)` for bands of rows, one a thread."""
-    bands = max(1, min(threads, rows))
-    edges = [rows * i // bands for i in range(bands + 1)]
-    _in_threads([lambda i=i: work(edges[i], edges[i + 1]) for i in range(bands)])
-
-
-def _in_threads(jobs: list[Callable[[], Any]]) -> None:
-    """Run the jobs, the first in this thread; no pool outlives the call."""
-    with ThreadPoolExecutor(max(1, len(jobs) - 1)) as pool:
-        others = [pool.submit(job) for job in jobs[1:]]
-        jobs[0]()
-        for other in others:
-            other.result()

@@ -17,12 +17,12 @@ from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from fusion.errors import FrameError
 from fusion.lidar import scattered_kernels
+from fusion.lidar.discrete import natural_discrete
 from fusion.lidar.scattered import (
     Extrapolate,
     Method,
     ScatteredInterpolant,
     interpolate,
-    natural_discrete,
 )
 
 SIZE = (50, 40)
