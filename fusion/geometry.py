@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -146,16 +146,26 @@ def checked_fov(fov_deg: float, limit_deg: float, what: str, *, inclusive: bool 
     return math.radians(fov_deg)
 
 
-def _check_intrinsics(camera: PinholeCamera | FisheyeCamera, lengths: tuple[int, ...], what: str) -> None:
-    checked_size(camera.size_wh)
-    if not (0 < camera.fx < math.inf and 0 < camera.fy < math.inf):
-        raise UsageError(f"focal lengths must be positive numbers, not {camera.fx:g}, {camera.fy:g}")
-    if not (math.isfinite(camera.cx) and math.isfinite(camera.cy)):
-        raise UsageError(f"the centre must be finite numbers, not {camera.cx:g}, {camera.cy:g}")
-    if len(camera.distortion) not in lengths:
-        raise UsageError(f"{len(camera.distortion)} {what} coefficients", hint=f"one of {lengths}")
-    if not all(abs(k) <= _LARGEST_COEFFICIENT for k in camera.distortion):  # NaN is not, either
-        raise UsageError(f"{what} coefficients out of all bounds: {list(camera.distortion)}")
+@dataclass(frozen=True, slots=True)
+class _Lens:
+    size_wh: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    _counts: ClassVar[tuple[int, ...]] = (0, 4)
+
+    def __post_init__(self) -> None:
+        checked_size(self.size_wh)
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf):
+            raise UsageError(f"focal lengths must be positive numbers, not {self.fx:g}, {self.fy:g}")
+        if not (math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise UsageError(f"the centre must be finite numbers, not {self.cx:g}, {self.cy:g}")
+        if len(self.distortion) not in self._counts:
+            raise UsageError(f"{len(self.distortion)} distortion coefficients", hint=f"one of {self._counts}")
+        if not all(abs(k) <= _LARGEST_COEFFICIENT for k in self.distortion):  # NaN is not, either
+            raise UsageError(f"distortion out of all bounds: {list(self.distortion)}")
 
 
 def _least_root(*polynomials: Floats) -> float:
@@ -177,29 +187,20 @@ def _inverse(radius: Callable[[Floats], Floats], values: Floats, top: float, ste
 
 
 @dataclass(frozen=True, slots=True)
-class PinholeCamera:
+class PinholeCamera(_Lens):
     """Pinhole with the distortion of OpenCV: (), (k1 k2 p1 p2), (… k3) or (… k4 k5 k6), in this order.
 
-    Beyond the radius where the distorted radius stops growing, points would fold back into the picture;
-    `project` says that it cannot see them.
+    Where the distorted radius stops growing, points would fold back into the picture (with tangential
+    distortion: where the map turns over); `project` says that it cannot see them, nor what lies beyond.
     """
 
-    size_wh: tuple[int, int]
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        _check_intrinsics(self, (0, 4, 5, 8), "distortion")
+    _counts: ClassVar[tuple[int, ...]] = (0, 4, 5, 8)
 
     @classmethod
     def of_fov(cls, size_wh: tuple[int, int], fov_deg: float) -> PinholeCamera:
         """Square pixels, centred, `fov_deg` from the left edge of the picture to the right one."""
-        half = checked_fov(fov_deg, 180, "pinhole") / 2
         checked_size(size_wh)
-        f = size_wh[0] / 2 / math.tan(half)
+        f = size_wh[0] / 2 / math.tan(checked_fov(fov_deg, 180, "pinhole") / 2)
         return cls(size_wh, f, f, (size_wh[0] - 1) / 2, (size_wh[1] - 1) / 2)
 
     @property
@@ -216,7 +217,7 @@ class PinholeCamera:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             a, b = x / z, y / z
             if any(self.distortion):
-                seen = seen & (a * a + b * b < self.valid_radius() ** 2)
+                seen = seen & (a * a + b * b < self.valid_radius() ** 2) & (self._growth(a, b)[3] > 0)
                 a, b = self._distort(a, b)
         return np.stack([self.fx * a + self.cx, self.fy * b + self.cy], -1), seen
 
@@ -238,58 +239,54 @@ class PinholeCamera:
     def _coefficients(self) -> tuple[float, ...]:
         return (*self.distortion, *([0.0] * (8 - len(self.distortion))))
 
-    def _radial(self, r2: Floats) -> Floats:
+    def _radial(self, r2: Floats) -> tuple[Floats, Floats]:
+        """The radial factor at a squared radius, and its derivative."""
         k1, k2, _, _, k3, k4, k5, k6 = self._coefficients()
-        return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        k = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+        return k, (k1 + r2 * (2 * k2 + r2 * 3 * k3) - k * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / below
+
+    def _growth(self, a: Floats, b: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """The derivatives of `_distort`, da'/da, da'/db = db'/da, db'/db, and their determinant."""
+        _, _, p1, p2, *_ = self._coefficients()
+        k, slope = self._radial(a * a + b * b)
+        aa = k + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
+        ab = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
+        bb = k + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
+        return aa, ab, bb, aa * bb - ab * ab
 
     def _distort(self, a: Floats, b: Floats) -> tuple[Floats, Floats]:
         _, _, p1, p2, *_ = self._coefficients()
         r2 = a * a + b * b
-        k = self._radial(r2)
+        k, _ = self._radial(r2)
         across = a * k + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
         return across, b * k + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
 
     def _undistort(self, a0: Floats, b0: Floats) -> tuple[Floats, Floats]:
-        """Bisection without the tangential part, then Newton's method, the Jacobian from differences.
-
-        NaN where that does not arrive: no direction falls there.
-        """
-        limit, r0, h = min(self.valid_radius(), 1e3), np.hypot(a0, b0), 1e-6
-        r = _inverse(lambda at: at * self._radial(at * at), r0, limit, 30)
+        """Bisection without the tangential part, then Newton's method; NaN where no direction falls there."""
+        limit, r0 = min(self.valid_radius(), 1e3), np.hypot(a0, b0)
+        r = _inverse(lambda at: at * self._radial(at * at)[0], r0, limit, 30)
         scale = np.divide(r, r0, out=np.ones_like(r), where=r0 > 0)
         a, b = scale * a0, scale * b0
         with np.errstate(all="ignore"):
-            for _ in range(12):
+            for _ in range(10):
                 fa, fb = self._distort(a, b)
-                ra, rb = fa - a0, fb - b0
-                (pa, pb), (ma, mb) = self._distort(a + h, b), self._distort(a - h, b)
-                (qa, qb), (na, nb) = self._distort(a, b + h), self._distort(a, b - h)
-                aa, ba, ab, bb = (pa - ma) / 2 / h, (pb - mb) / 2 / h, (qa - na) / 2 / h, (qb - nb) / 2 / h
-                det = aa * bb - ab * ba
-                a, b = a - (bb * ra - ab * rb) / det, b - (aa * rb - ba * ra) / det
+                ra, rb, (aa, ab, bb, det) = fa - a0, fb - b0, self._growth(a, b)
+                a, b = a - (bb * ra - ab * rb) / det, b - (aa * rb - ab * ra) / det
                 shrink = np.minimum(1, limit / np.maximum(np.hypot(a, b), 1e-12))
                 a, b = a * shrink, b * shrink
             fa, fb = self._distort(a, b)
             arrived = np.hypot(fa - a0, fb - b0) < 1e-9 * np.maximum(1, r0)
+            arrived &= self._growth(a, b)[3] > 0
         return np.where(arrived, a, np.nan), np.where(arrived, b, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class FisheyeCamera:
+class FisheyeCamera(_Lens):
     """Kannala-Brandt: radius = f (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9), t the angle to the axis.
 
     Without coefficients it is the equidistant fisheye.
     """
-
-    size_wh: tuple[int, int]
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        _check_intrinsics(self, (0, 4), "fisheye")
 
     @classmethod
     def of_fov(cls, size_wh: tuple[int, int], fov_deg: float) -> FisheyeCamera:

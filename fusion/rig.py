@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt, ValidationError
 
@@ -45,6 +46,17 @@ class Rig:
 
     cameras: Mapping[str, RigCamera] = field(default_factory=dict)
     transforms: Mapping[str, Floats] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Own copies, their rotations orthonormal. `UsageError` for one that is not rigid, or misnamed."""
+        rigid = {}
+        for name, T in self.transforms.items():
+            _sensors(name)
+            try:
+                rigid[name] = checked_pose(T)
+            except UsageError as error:
+                raise UsageError(f"{name}: {error.what}", hint=error.hint) from None
+        object.__setattr__(self, "transforms", rigid)
 
     def camera(self, name: str) -> RigCamera:
         """The camera `name`. Raises `UsageError` that lists those there are."""
@@ -81,28 +93,19 @@ class Rig:
 def load_rig(path: str | Path) -> Rig:
     """Read a rig.toml. Raises `UsageError` naming the file and the key."""
     try:
-        if Path(path).stat().st_size > _LARGEST_FILE_BYTES:
-            raise UsageError("too large for a rig", where=path)
-        text = Path(path).read_text(encoding="utf-8")
-        content = _RigFile.model_validate(tomllib.loads(text))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(f"the rig cannot be read: {reason}", where=path) from None
+        content = _RigFile.model_validate(tomllib.loads(_text(path)))
+        cameras = {name: _camera(name, entry) for name, entry in content.cameras.items()}
+        return Rig(cameras, {name: np.array(rows, np.float64) for name, rows in content.transforms.items()})
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in problem["loc"])
         raise UsageError(
             f"{key}: {problem['msg'].lower()}", where=path, hint="see docs/conventions.md"
         ) from None
-    try:
-        cameras = {name: entry.camera() for name, entry in content.cameras.items()}
-        transforms = {}
-        for name, matrix in content.transforms.items():
-            _sensors(name)
-            transforms[name] = checked_pose(matrix)
+    except (ValueError, RecursionError) as error:  # no TOML, or one made to break its reader
+        raise UsageError(f"the rig cannot be read: {error}", where=path) from None
     except UsageError as error:
         raise UsageError(error.what, where=path, hint=error.hint) from None
-    return Rig(cameras, transforms)
 
 
 def save_rig(path: str | Path, rig: Rig) -> None:
@@ -115,6 +118,17 @@ def save_rig(path: str | Path, rig: Rig) -> None:
     replace_file(Path(path), tomlkit.dumps(content).encode())
 
 
+def _text(path: str | Path) -> str:
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(_LARGEST_FILE_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"the rig cannot be read: {error.strerror or error}") from None
+    if len(data) > _LARGEST_FILE_BYTES:
+        raise UsageError("too large for a rig")
+    return data.decode("utf-8")
+
+
 class _CameraEntry(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
@@ -123,9 +137,6 @@ class _CameraEntry(BaseModel):
     focal_px: tuple[FiniteFloat, FiniteFloat]
     centre_px: tuple[FiniteFloat, FiniteFloat]
     distortion: tuple[FiniteFloat, ...] = ()
-
-    def camera(self) -> RigCamera:
-        return _MODELS[self.model](self.size_wh, *self.focal_px, *self.centre_px, self.distortion)
 
 
 _Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
@@ -139,11 +150,18 @@ class _RigFile(BaseModel):
     transforms: dict[str, Annotated[list[_Row], Field(min_length=3, max_length=4)]] = {}
 
 
+def _camera(name: str, entry: _CameraEntry) -> RigCamera:
+    try:
+        return _MODELS[entry.model](entry.size_wh, *entry.focal_px, *entry.centre_px, entry.distortion)
+    except UsageError as error:
+        raise UsageError(f"cameras.{name}: {error.what}", hint=error.hint) from None
+
+
 def _entry(camera: RigCamera) -> dict[str, object]:
     model = next(name for name, kind in _MODELS.items() if isinstance(camera, kind))
     return {
         "model": model,
-        "size_wh": list(camera.size_wh),
+        "size_wh": [int(n) for n in camera.size_wh],
         "focal_px": [float(camera.fx), float(camera.fy)],
         "centre_px": [float(camera.cx), float(camera.cy)],
         "distortion": [float(k) for k in camera.distortion],
