@@ -41,6 +41,11 @@ DEPTH_EXAMPLES = """Examples:
   fusion depth --sparse velodyne_raw/ -o out/ --score groundtruth/
   fusion depth --sparse sparse/ --guide rgb/ --method guided -o out/"""
 
+MINE_EXAMPLES = """Examples:
+  fusion simulate mine mine/
+  fusion simulate mine dusty/ --preset dusty --seed 3 --duration 20
+  fusion simulate mine fast/ --speed 3 --max-rate 200 --rings 16"""
+
 app = App(
     name="fusion",
     help="Fused RGB-thermal frames for trackers. Start with: fusion blend RGB FIR -o OUT --preview",
@@ -60,6 +65,17 @@ datasets.command(
 )
 app.command(datasets)
 simulate = App(name="simulate", help="Make sample data with the truth beside it.")
+simulate.command(
+    "fusion.cli.simulate:simulate_mine",
+    name="mine",
+    help="Fly through a synthetic mine: RGB, thermal, LiDAR, and the truth beside them.",
+    help_epilogue=MINE_EXAMPLES,
+)
+simulate.command(
+    "fusion.cli.simulate:simulate_session",
+    name="session",
+    help="Show a heated board to all three sensors of the synthetic mine, for calibration.",
+)
 simulate.command(
     "fusion.cli.simulate:simulate_pairs",
     name="pairs",
