@@ -52,7 +52,8 @@ class Hits:
 class Scene(Protocol):
     """Anything that rays can be cast into."""
 
-    materials: tuple[Material, ...]
+    @property
+    def materials(self) -> tuple[Material, ...]: ...
 
     def cast(self, rays: Floats, **options: Any) -> Hits:
         """N x 6 float32 rays (origin, unit direction; world frame, metres) to where they end."""
