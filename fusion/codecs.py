@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from fusion.errors import FrameError
 from fusion.png import decode_plain
+from fusion.png16 import encode_png16
 
 try:
     import fpng
@@ -77,12 +78,16 @@ def decode_image(data: bytes, where: str, max_pixels: int = MAX_PIXELS) -> Pixel
 def encode_png(pixels: Pixels) -> bytes:
     """Encode losslessly as PNG: H x W, H x W x 3 (BGR) or H x W x 4 (BGRA), uint8 or uint16.
 
-    8-bit colour goes through fpng where it is installed; the bytes of the file (not its pixels) depend
-    on which encoder is there.
+    8-bit colour goes through fpng, 16 bits through ISA-L, where they are installed; the bytes of the file
+    (not its pixels) depend on which encoder is there.
     """
     if fpng is not None and pixels.ndim == 3 and pixels.dtype == np.uint8:
         order = cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
         return fpng.from_ndarray(cv2.cvtColor(pixels, order))
+    if pixels.dtype == np.uint16:
+        packed = encode_png16(pixels)
+        if packed is not None:
+            return packed
     # one channel of 8 bits is a mask here: OpenCV's own choice of filter is far smaller and faster on those
     options = () if pixels.ndim == 2 and pixels.dtype == np.uint8 else _PNG_FAST
     done, data = cv2.imencode(".png", pixels, options)

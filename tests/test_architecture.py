@@ -12,7 +12,7 @@ import fusion
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors", "frames"},
-    {"files", "tables", "settings", "open3d", "codecs", "png", "unfilter", "kernels", "geometry"},
+    {"files", "tables", "settings", "open3d", "codecs", "png", "png16", "unfilter", "kernels", "geometry"},
     {"rig"},
     {
         "sources",
@@ -38,6 +38,8 @@ FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 SAME_FLOOR = {
     ("codecs", "png"),
     ("png", "unfilter"),
+    ("codecs", "png16"),
+    ("png16", "kernels"),
     ("unfilter", "kernels"),
     ("registration", "homography"),
     ("registration", "warp"),

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image as Pillow
 
-from fusion import codecs
+from fusion import codecs, png16
 from fusion.codecs import decode_image, encode_jpeg, encode_png
 from fusion.errors import FrameError
 
@@ -513,3 +513,24 @@ def test_real_counts_survive(shared_data: Path) -> None:
         pixels = decode_image(data, str(file))
         assert pixels.dtype == np.uint16
         assert (pixels.ravel() == raw).all(), file
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (1, 1), (6, 4, 3), (64, 48)])
+@pytest.mark.parametrize("packer", ["isal", "opencv"])
+def test_16_bit_png_keeps_every_value(
+    shape: tuple[int, ...], packer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if packer == "opencv":
+        monkeypatch.setattr(png16, "isal_zlib", None)
+    pixels = np.random.default_rng(0).integers(0, 65536, shape).astype(np.uint16)
+    data = encode_png(pixels)
+    assert np.array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+    assert np.array_equal(decode_image(data, ""), pixels)
+
+
+def test_16_bit_png_takes_views_and_leaves_them_alone() -> None:
+    whole = np.random.default_rng(1).integers(0, 65536, (20, 30, 3)).astype(np.uint16)
+    before = whole.copy()
+    part = whole[::-1, 3:17, ::-1]
+    assert np.array_equal(decode_image(encode_png(part), ""), part)
+    assert np.array_equal(whole, before)

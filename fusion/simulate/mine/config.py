@@ -6,19 +6,19 @@ it is what runs, and what `truth/mine.toml` records. Unknown keys are refused at
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from fusion.errors import UsageError
+from fusion.settings import Group, first_problem, merged, read_settings
 from fusion.simulate.mine.scene_config import BoardConfig, FlightConfig, SceneConfig
 
 FORMAT = "fusion-mine/1"
-MAX_CONFIG_BYTES = 1 << 20
+EPOCH_S = 1_700_000_000.0  # so that stamps look like those of real recordings
 
 Preset = Literal["clear", "dark", "dusty", "over-exposed"]
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
@@ -43,18 +43,14 @@ Pixels = Annotated[int, Field(ge=16, le=4096)]
 Rate = Annotated[float, Field(gt=0, le=240)]
 
 
-class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ClockConfig(_Group):
+class ClockConfig(Group):
     """A sensor's own clock: own = true * (1 + drift) + offset; `drift_ppm` is 1e6 drift."""
 
     offset_s: Annotated[float, Field(ge=0, le=4e9)]
     drift_ppm: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
 
 
-class MountConfig(_Group):
+class MountConfig(Group):
     """Where a sensor sits on the drone: body frame (x forward, y left, z up), metres; degrees around z, y, x.
 
     Without rotation a camera looks along the body's x axis, upright, and a LiDAR's axes are the body's.
@@ -64,7 +60,7 @@ class MountConfig(_Group):
     yaw_pitch_roll_deg: Vector = (0.0, 0.0, 0.0)
 
 
-class CameraConfig(_Group):
+class CameraConfig(Group):
     """A pinhole camera with radial-tangential distortion (k1 k2 p1 p2 k3)."""
 
     size_wh: tuple[Pixels, Pixels]
@@ -73,7 +69,7 @@ class CameraConfig(_Group):
     distortion: tuple[Finite, Finite, Finite, Finite, Finite]
 
 
-class LampsConfig(_Group):
+class LampsConfig(Group):
     """Head lamps on the drone; `intensity` is radiant intensity on the beam's axis, in arbitrary units a
     steradian.
 
@@ -93,7 +89,7 @@ class LampsConfig(_Group):
     scene_gain: NotNegative = 1.0  # times the intensities of the scene's own lamps
 
 
-class DustConfig(_Group):
+class DustConfig(Group):
     """Homogeneous extinction from the visual range (Koschmieder: 3.912 / visibility) times drifting dust."""
 
     visibility_m: Annotated[float, Field(ge=1, le=10_000)] = 900.0
@@ -106,7 +102,7 @@ class DustConfig(_Group):
     lidar_false_share: Share = 0.25  # of dimmed pulses that return from dust
 
 
-class RgbConfig(_Group):
+class RgbConfig(Group):
     """The RGB camera; noise after EMVA 1288: photon noise, read noise, conversion gain, full well.
 
     `sensitivity_e` is electrons a second and a unit of radiance; `gain_e_per_dn` belongs to 12-bit counts,
@@ -120,7 +116,7 @@ class RgbConfig(_Group):
         distortion=(-0.19, 0.035, 4e-4, -3e-4, 0.0),
     )
     mount: MountConfig = MountConfig(position_m=(0.12, 0.0, 0.0))
-    clock: ClockConfig = ClockConfig(offset_s=1000.0)
+    clock: ClockConfig = ClockConfig(offset_s=EPOCH_S)
     rate_hz: Rate = 20.0
     exposure_ms: Annotated[float, Field(gt=0, le=200)] = 8.0
     sensitivity_e: Positive = 450_000.0
@@ -136,7 +132,7 @@ class RgbConfig(_Group):
     quality: Annotated[int, Field(ge=1, le=100)] = 92
 
 
-class ThermalConfig(_Group):
+class ThermalConfig(Group):
     """The thermal camera: a microbolometer with `time_constant_ms` lag; counts are linear in apparent
     temperature.
 
@@ -152,7 +148,7 @@ class ThermalConfig(_Group):
         distortion=(-0.24, 0.07, -5e-4, 6e-4, 0.0),
     )
     mount: MountConfig = MountConfig(position_m=(0.11, -0.075, 0.02), yaw_pitch_roll_deg=(-1.2, 0.8, 0.6))
-    clock: ClockConfig = ClockConfig(offset_s=1000.037, drift_ppm=25.0)
+    clock: ClockConfig = ClockConfig(offset_s=EPOCH_S + 0.037, drift_ppm=25.0)
     rate_hz: Rate = 25.0
     kelvin_per_count: Positive = 0.04
     air_degC: Finite = 10.0  # noqa: N815 - what surfaces reflect, and what the air between radiates
@@ -170,7 +166,7 @@ class ThermalConfig(_Group):
     ffc_freeze_s: NotNegative = 0.4
 
 
-class LidarConfig(_Group):
+class LidarConfig(Group):
     """A spinning LiDAR: all rings fire at once, one column after the other, from the back, counter-clockwise.
 
     A return is lost where its power, reflectance * cos(incidence) * exp(-2 extinction range) / range^2, is
@@ -178,7 +174,7 @@ class LidarConfig(_Group):
     """
 
     mount: MountConfig = MountConfig(position_m=(0.05, 0.0, 0.10), yaw_pitch_roll_deg=(0.4, -0.7, 0.3))
-    clock: ClockConfig = ClockConfig(offset_s=1000.0041, drift_ppm=-8.0)
+    clock: ClockConfig = ClockConfig(offset_s=EPOCH_S + 0.0041, drift_ppm=-8.0)
     rate_hz: Rate = 10.0
     rings: Literal[16, 32, 64, 128] = 64
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
@@ -197,7 +193,7 @@ class LidarConfig(_Group):
         return self
 
 
-class MineConfig(_Group):
+class MineConfig(Group):
     """The effective settings of a recording. `MineConfig.of(preset="dusty", seed=3)` fills in the preset."""
 
     format: Literal["fusion-mine/1"] = FORMAT
@@ -217,7 +213,7 @@ class MineConfig(_Group):
     @classmethod
     def of(cls, settings: Mapping[str, Any] | None = None, **groups: Any) -> MineConfig:
         """Check settings (nested as in the TOML file) over their preset. Raises `UsageError`."""
-        return _validated(_merged(settings or {}, groups), where="settings")
+        return _validated(merged(settings or {}, groups), where="settings")
 
     def toml(self) -> str:
         """The text of a file that `load_mine_config` reads back to the same settings."""
@@ -229,21 +225,8 @@ def load_mine_config(path: Path | None, overrides: Mapping[str, Any] | None = No
 
     Raises `UsageError` naming the file and the key that is wrong.
     """
-    settings = {} if path is None else _read_toml(path)
-    return _validated(_merged(settings, overrides or {}), where="options" if path is None else str(path))
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise UsageError("too large for a configuration", where=path)
-        settings = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"cannot be read as TOML: {error}", where=path) from None
-    if settings.get("format") != FORMAT:
-        hint = f'its first line must be format = "{FORMAT}"'
-        raise UsageError("no configuration of a simulated mine", where=path, hint=hint)
-    return settings
+    settings = {} if path is None else read_settings(path, FORMAT)
+    return _validated(merged(settings, overrides or {}), where="options" if path is None else str(path))
 
 
 def _validated(settings: Mapping[str, Any], where: str) -> MineConfig:
@@ -251,20 +234,7 @@ def _validated(settings: Mapping[str, Any], where: str) -> MineConfig:
     if preset not in PRESETS:
         raise UsageError(f"unknown preset {preset!r}", where=where, hint=f"one of: {', '.join(PRESETS)}")
     try:
-        whole = _merged(_merged(MineConfig().model_dump(), PRESETS[preset]), settings)
+        whole = merged(merged(MineConfig().model_dump(), PRESETS[preset]), settings)
         return MineConfig.model_validate(whole)
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in problem["loc"])
-        more = error.error_count() - 1
-        text = f"{key}: {problem['msg'].lower()}" + (f" (and {more} more)" if more else "")
-        raise UsageError(text, where=where) from None
-
-
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in over.items():
-        known = merged.get(key)
-        both = isinstance(known, Mapping) and isinstance(value, Mapping)
-        merged[key] = _merged(known, value) if both else value  # type: ignore[arg-type]
-    return merged
+        raise UsageError(first_problem(error), where=where) from None

@@ -40,7 +40,7 @@ class Hits:
 
     `range_m` (N float32) is the length of each unit ray, inf where it met nothing; `normal` (N x 3 float32,
     unit) is the geometric normal, turned towards the ray's origin; `material` (N uint8) indexes the scene's
-    `materials`; `printed` (N float32) is NaN, except on the board: there the reflectance of its pattern, [0, 1].
+    `materials`; `printed` (N float32) is NaN, except on the board: there the reflectance of its pattern.
     """
 
     range_m: Floats

@@ -202,21 +202,6 @@ def flow(xn, yn, z_m, T, K, next_z_m, out, hidden):
 
 
 @compiled
-def png_rows(samples, out):
-    """Rows of uint16 samples (H x S) as PNG stores them: the filter "up" before big-endian bytes (H x 1 + 2
-    S).
-    """
-    height, count_ = samples.shape
-    for r in range(height):
-        out[r, 0] = np.uint8(2)
-        for s in range(count_):
-            value = samples[r, s]
-            above = samples[r - 1, s] if r > 0 else np.uint16(0)
-            out[r, 1 + 2 * s] = np.uint8((value >> 8) - (above >> 8))
-            out[r, 2 + 2 * s] = np.uint8((value & 0xFF) - (above & 0xFF))
-
-
-@compiled
 def splat(grains, fx, fy, cx, cy, v, w, span_s, radiance):
     """Add discs out of focus, drawn out by motion, to `radiance` (H x W x 3, in place); see `dust.grains`."""
     height, width = radiance.shape[0], radiance.shape[1]

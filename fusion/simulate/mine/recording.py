@@ -28,7 +28,6 @@ from fusion.simulate.mine.lidar import LidarSensor
 from fusion.simulate.mine.lights import Lit
 from fusion.simulate.mine.motion import Clock, instants, mounted, twist
 from fusion.simulate.mine.motion import Path as Flown
-from fusion.simulate.mine.png16 import encode_png16
 from fusion.simulate.mine.rgb import RgbSensor
 from fusion.simulate.mine.textures import cloud_volume
 from fusion.simulate.mine.thermal import ThermalSensor
@@ -182,7 +181,7 @@ class _Recorder:
         data = encode_jpeg(bgr, c.quality) if c.file == "jpg" else encode_png(bgr)
         replace_file(self._out / "rgb" / f"{stamp}.{c.file}", data)
         if self._config.truth:
-            self._truth("depth_rgb", stamp, encode_png16(view.depth))
+            self._truth("depth_rgb", stamp, encode_png(view.depth))
         return _Seen(stamp, view.z_m, T_world_rgb)
 
     def _flow(self, this: _Seen, following: _Seen) -> None:
@@ -193,7 +192,7 @@ class _Recorder:
         K = np.array([c.fx, c.fy, c.cx, c.cy, *c.distortion])
         T_next_this = invert(following.T_world_rgb) @ this.T_world_rgb
         image_kernels.flow(x, y, this.z_m, T_next_this, K, following.z_m, out, hidden)
-        self._truth("flow_rgb", this.stamp_ns, encode_png16(out))
+        self._truth("flow_rgb", this.stamp_ns, encode_png(out[..., ::-1]))
         self._truth("occluded_rgb", this.stamp_ns, encode_png(hidden))
 
     def _make_fir(self, k: int) -> int:
@@ -203,14 +202,14 @@ class _Recorder:
             t = self._times["fir"][k]
             counts, kelvin = self._fir.picture(view, k, t, twist(self._path, t, self._mounts["fir"]))
             if self._shown[k] == k:
-                data = encode_png16(counts)
+                data = encode_png(counts)
                 for same in range(k, len(self._shown)):
                     if self._shown[same] != k:
                         break
                     replace_file(self._out / "fir" / f"{self._stamp('fir', same)}.png", data)
             if self._config.truth:
-                self._truth("depth_fir", self._stamp("fir", k), encode_png16(view.depth))
-                self._truth("temperature_fir", self._stamp("fir", k), encode_png16(kelvin))
+                self._truth("depth_fir", self._stamp("fir", k), encode_png(view.depth))
+                self._truth("temperature_fir", self._stamp("fir", k), encode_png(kelvin))
         return 0
 
     def _make_scan(self, k: int) -> int:

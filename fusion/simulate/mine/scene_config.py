@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from fusion.settings import Group
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SceneConfig(_Table):
+class SceneConfig(Group):
     """The drift. Lengths in metres; the floor is at z = 0, the drift starts at the origin along +x."""
 
     length_m: Annotated[float, Field(ge=60, le=120)] = 75.0
@@ -27,7 +25,7 @@ class SceneConfig(_Table):
     person: bool = True
 
 
-class FlightConfig(_Table):
+class FlightConfig(Group):
     """A small drone along the drift, 1.5 m above its floor. Amplitudes are bounds; so is `max_rate_deg_s`."""
 
     speed_m_s: _Positive = 1.5
@@ -39,7 +37,7 @@ class FlightConfig(_Table):
     jerks_per_s: Annotated[float, Field(ge=0, le=2)] = 0.15  # sudden attitude bumps
 
 
-class BoardConfig(_Table):
+class BoardConfig(Group):
     """The calibration board and how it is moved.
 
     `cols` x `rows` are inner corners, or circles as OpenCV counts them. `square_m` is the side of a

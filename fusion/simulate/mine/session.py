@@ -22,7 +22,6 @@ from fusion.simulate.mine.board import Session, build_session
 from fusion.simulate.mine.config import MineConfig
 from fusion.simulate.mine.lidar import LidarSensor
 from fusion.simulate.mine.motion import Clock, mounted
-from fusion.simulate.mine.png16 import encode_png16
 from fusion.simulate.mine.recording import Progress, Report
 from fusion.simulate.mine.rgb import RgbSensor
 from fusion.simulate.mine.textures import cloud_volume
@@ -84,7 +83,7 @@ class _Sitting:
         replace_file(self._out / "rgb" / f"{rgb}.{c.file}", data)
         seen = self._fir.viewer.at(body @ self._mounts["fir"], scene)
         counts, kelvin = self._fir.picture(seen, k, t, _STILL)
-        replace_file(self._out / "fir" / f"{fir}.png", encode_png16(counts))
+        replace_file(self._out / "fir" / f"{fir}.png", encode_png(counts))
         cloud = self._lidar.scan(_Standing(body), t, k, scene)
         write_pcd(self._out / "lidar" / f"{lidar}.pcd", cloud)
         if self._config.truth:
@@ -94,7 +93,7 @@ class _Sitting:
                 ("temperature_fir", fir, kelvin),
             )
             for kind, stamp, image in dense:
-                replace_file(self._out / "truth" / kind / f"{stamp}.png", encode_png16(image))
+                replace_file(self._out / "truth" / kind / f"{stamp}.png", encode_png(image))
         return len(cloud)
 
     def _write_small(self) -> None:
