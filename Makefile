@@ -3,13 +3,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test check lint types wheel notebooks bench clean
+.PHONY: help demo test check lint types wheel notebooks bench accuracy clean
 
 help:
 	@echo "make demo       sample data, the main job on it, where to look"
 	@echo "make test       the tests"
 	@echo "make check      all that CI runs: lint, types, tests, notebooks, wheel"
 	@echo "make bench      the benchmarks; writes docs/benchmarks.md"
+	@echo "make accuracy   errors of every depth method; writes its tables into docs/depth.md"
 	@echo "make notebooks  run the notebooks"
 	@echo "make clean      remove environments and products"
 
@@ -22,10 +23,11 @@ $(VENV)/ready: pyproject.toml
 
 demo: $(VENV)/ready
 	rm -rf demo
-	$(BIN)/fusion simulate pairs demo
-	$(BIN)/fusion blend demo/rgb demo/fir -o demo/fused --pair index --points demo/points.csv --preview
+	$(BIN)/fusion simulate mine demo/mine --duration 1
+	$(BIN)/fusion blend demo/mine/rgb demo/mine/fir -o demo/fused --pair stamp --homography demo/mine/truth/homography_5m.toml --preview
+	$(BIN)/fusion depth demo/mine/lidar -o demo/depth --rig demo/mine/truth/rig.toml --overlay demo/mine/rgb
 	@echo
-	@echo "Look at demo/fused/preview.png, then at the frames in demo/fused/fused/ and the index demo/fused/frames.csv"
+	@echo "Look at demo/fused/preview.png, at demo/depth/picture/ and demo/depth/overlay/, then at the frames in demo/fused/fused/ and the indexes frames.csv"
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest
@@ -53,6 +55,9 @@ check: lint types test notebooks wheel
 
 bench: $(VENV)/ready
 	$(BIN)/python benchmarks/bench.py --write docs/benchmarks.md
+
+accuracy: $(VENV)/ready
+	$(BIN)/python benchmarks/accuracy.py --write docs/depth.md
 
 clean:
 	rm -rf $(VENV) demo dist .pytest_cache .ruff_cache .hypothesis

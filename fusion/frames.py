@@ -80,8 +80,8 @@ class PointCloud:
     `xyz_m` is N x 3 float32 (float64 where coordinates are large, as in LAS), finite, never exactly
     (0, 0, 0), which is how scanners write "no return". `fields` holds what else is known of each point, N
     values each, under the names ``intensity``, ``ring`` (integer, as the file numbers its lasers), ``time_s``
-    (seconds) or the file's own. `read` is how many points the file had; `dropped` says in one word each how many were
-    left out, and why (``nan``, ``zero``, ``range``, ``box``, ``voxel``, ``outlier``).
+    (seconds) or the file's own. `read` is how many points the file had; `dropped` says in one word each how
+    many were left out, and why (``nan``, ``zero``, ``range``, ``box``, ``voxel``, ``outlier``).
     """
 
     xyz_m: NDArray[np.float32] | NDArray[np.float64]

@@ -130,7 +130,13 @@ def load_depth_config(path: Path | None, overrides: Mapping[str, Any]) -> DepthC
     Paths inside the file count from the file's own folder. Raises `UsageError` naming the key.
     """
     settings = {} if path is None else read_settings(path, FORMAT, PATHS)
-    for group in ("cloud", "camera", "samples", "dense", "picture"):  # else an option would replace what it is
+    for group in (
+        "cloud",
+        "camera",
+        "samples",
+        "dense",
+        "picture",
+    ):  # else an option would replace what it is
         if not isinstance(settings.get(group, {}), Mapping):
             raise UsageError(f"{group} is no table", where=str(path), hint=f"write [{group}], then its keys")
     return _validated(merged(settings, overrides), where="options" if path is None else str(path))
@@ -156,7 +162,9 @@ def _check_spans(config: DepthConfig, where: str) -> None:
         ("picture.show_m", config.picture.show_m, FARTHEST_SHOWN_M),
     ):
         if span is not None and not 0 <= span[0] < span[1] <= most:
-            hint = "LEAST MOST, metres" + (f", at most {math.floor(most * 1000) / 1000:.10g}" if most < math.inf else "")
+            hint = "LEAST MOST, metres" + (
+                f", at most {math.floor(most * 1000) / 1000:.10g}" if most < math.inf else ""
+            )
             raise UsageError(f"{name}: {span[0]:g} to {span[1]:g} is no range", where=where, hint=hint)
     box = config.cloud.box_m
     if box is not None and not all(lo < hi for lo, hi in zip(box[:3], box[3:], strict=True)):

@@ -16,6 +16,8 @@ from fusion.lidar.sparse import DenseDepth, SparseDepth
 from fusion.tables import lookup
 
 Extrapolate = Literal["none", "nearest", "linear"]
+Scattered = Literal["linear", "natural", "nearest"]
+MOST_TRIANGULATED = 4_000_000  # the triangulation takes some hundred bytes a sample
 GAP_OF_SPACING = 6.0  # the largest gap, in medians of a pixel's distance to its sample
 
 
@@ -39,31 +41,35 @@ Fill = Callable[[SparseDepth, Demand], NDArray[np.float32]]
 """H x W float32 values, 0 or NaN where the method has none; gaps, limits and support are seen to outside."""
 
 
-def _scattered(method: Literal["linear", "natural", "nearest"]) -> Fill:
-    """MATLAB's scatteredInterpolant (thesis 6.2): in the values themselves, exact positions."""
+def _interpolated(
+    method: Scattered, sparse: SparseDepth, demand: Demand
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """MATLAB's scatteredInterpolant (thesis 6.2): in the values themselves, exact positions; and its hull."""
+    from fusion.lidar.scattered import interpolate
 
-    def fill(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
-        from fusion.lidar.scattered import interpolate
+    if len(sparse) > MOST_TRIANGULATED and (method != "nearest" or demand.extrapolate == "linear"):
+        hint = f"at most {MOST_TRIANGULATED:,}: --voxel METRES, or --method plane"
+        raise FrameError(f"{len(sparse):,} samples are too many to triangulate", hint=hint)
+    return interpolate(
+        sparse.u,
+        sparse.v,
+        sparse.value_m,
+        sparse.size_wh,
+        method=method,
+        extrapolate=demand.extrapolate,
+        threads=demand.threads,
+    )
 
-        values, _ = interpolate(
-            sparse.u,
-            sparse.v,
-            sparse.value_m,
-            sparse.size_wh,
-            method=method,
-            extrapolate=demand.extrapolate,
-            threads=demand.threads,
-        )
-        return values
 
-    return fill
+def _scattered(method: Scattered) -> Fill:
+    return lambda sparse, demand: _interpolated(method, sparse, demand)[0]
 
 
 def _natural_discrete(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
     from fusion.lidar.discrete import natural_discrete
 
     inverse = natural_discrete(sparse.u, sparse.v, 1 / sparse.value_m, sparse.size_wh, threads=demand.threads)
-    return 1 / inverse
+    return np.asarray(1 / inverse, np.float32)
 
 
 def _scan(sparse: SparseDepth, _: Demand) -> NDArray[np.float32]:
@@ -97,7 +103,8 @@ DENSIFIERS: dict[str, Fill] = {
     "scan": _scan,
     "guided": _guided,
 }
-LINEAR_BEYOND = {"linear", "natural", "nearest"}  # those that can extrapolate by slope
+# Those that can extrapolate by slope; they know themselves what lies inside the samples' hull.
+LINEAR_BEYOND: dict[str, Scattered] = {"linear": "linear", "natural": "natural", "nearest": "nearest"}
 
 
 def densifier(name: str) -> Fill:
@@ -108,7 +115,7 @@ def densifier(name: str) -> Fill:
 def check_beyond(method: str, extrapolate: Extrapolate) -> None:
     """Refuse, before any work, extrapolation that `method` has no slope for. Raises `UsageError`."""
     if extrapolate == "linear" and method in DENSIFIERS and method not in LINEAR_BEYOND:
-        hint = f"{', '.join(sorted(LINEAR_BEYOND))} can; or --extrapolate nearest"
+        hint = f"{', '.join(LINEAR_BEYOND)} can; or --extrapolate nearest"
         raise UsageError(f"{method} cannot extrapolate linearly", where="--extrapolate", hint=hint)
 
 
@@ -125,12 +132,16 @@ def densify(sparse: SparseDepth, method: str = "plane", demand: Demand | None = 
     check_beyond(method, demand.extrapolate)
     if not len(sparse):
         raise FrameError("no sample to fill in from")
-    values = np.nan_to_num(fill(sparse, demand), copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-    near_px, hull = _distance_px(sparse), _hull(sparse)
-    gap = demand.max_gap_px or max(GAP_OF_SPACING * float(np.median(near_px[hull])), 1.5)
+    near_px, inside = _distance_px(sparse), _hull(sparse)
+    gap = demand.max_gap_px or max(GAP_OF_SPACING * float(np.median(near_px[inside])), 1.5)
+    if method in LINEAR_BEYOND:
+        values, inside = _interpolated(LINEAR_BEYOND[method], sparse, demand)
+    else:
+        values = fill(sparse, demand)
+    values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
     lo, hi = demand.limits_m
     good = (values >= lo) & (values <= hi) & (values > 0)
-    support = good & hull & (near_px <= gap)
+    support = good & inside & (near_px <= gap)
     if demand.extrapolate == "none":
         return DenseDepth(np.where(support, values, np.float32(0)), support, sparse.value)
     if demand.extrapolate == "nearest":

@@ -66,7 +66,8 @@ class DepthLane:
         self, cloud: PointCloud, *, guide_bgr: NDArray[np.uint8] | None = None, threads: int = 1
     ) -> DepthFrame:
         """Dense depth of a cloud. Raises `FrameError`, with the likely cause, when no sample is left."""
-        cloud = cleaned(cloud, self.config.cloud)
+        whole = cloud if cloud.read is not None else replace(cloud, read=len(cloud))  # before the crops
+        cloud = cleaned(whole, self.config.cloud)
         ring = rings_of(cloud) if len(cloud) else None
         if ring is not None:
             cloud = replace(cloud, fields={**cloud.fields, "ring": ring})

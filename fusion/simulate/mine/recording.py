@@ -20,6 +20,7 @@ from fusion.codecs import encode_jpeg, encode_png
 from fusion.errors import UsageError
 from fusion.files import replace_file
 from fusion.geometry import Floats, invert
+from fusion.registration import write_homography
 from fusion.rig import Rig, save_rig
 from fusion.simulate.mine import image_kernels, layout
 from fusion.simulate.mine.config import MineConfig
@@ -28,6 +29,7 @@ from fusion.simulate.mine.lidar import LidarSensor
 from fusion.simulate.mine.lights import Lit
 from fusion.simulate.mine.motion import Clock, instants, mounted, twist
 from fusion.simulate.mine.motion import Path as Flown
+from fusion.simulate.mine.plane_at import homography_at
 from fusion.simulate.mine.rgb import RgbSensor
 from fusion.simulate.mine.textures import cloud_volume
 from fusion.simulate.mine.thermal import ThermalSensor
@@ -221,6 +223,7 @@ class _Recorder:
         truth = self._out / "truth"
         replace_file(truth / "mine.toml", self._config.toml().encode())
         save_rig(truth / "rig.toml", self.rig())
+        write_homography(truth / "homography_5m.toml", homography_at(self.rig(), 5.0))
         layout.write_clocks(truth / "clocks.toml", self._clocks)
         for name, times in self._times.items():
             layout.write_tum(
