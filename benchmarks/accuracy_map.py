@@ -18,7 +18,7 @@ from fusion.lidar.project import from_image
 from fusion.lidar.sparse import SparseDepth
 from fusion.lidar.surfels import Surfels, surfels_of, visible_in_map
 
-METHODS = ("plane", "natural-discrete", "natural", "linear", "nearest")
+METHODS = ("plane", "plane-fast", "natural-discrete", "natural", "linear", "nearest")
 CAMERA = PinholeCamera.of_fov((640, 480), 120)
 STATIONS, HEIGHT_M, FREE_M = 12, 1.2, 0.8
 HELD, LIMITS_M = 0.2, (1.0, 10.0)

@@ -23,7 +23,7 @@ from fusion.simulate.mine.rgb import camera_of
 from fusion.simulate.mine.textures import cloud_volume
 
 RINGS = (16, 32, 64, 128)
-METHODS = ("plane", "natural-discrete", "scan", "natural", "linear", "nearest")
+METHODS = ("plane", "plane-fast", "natural-discrete", "scan", "natural", "linear", "nearest")
 BANDS_M = ((0, 3), (3, 6), (6, 12), (12, 30))
 EDGE_SHARE, EDGE_PX = 0.1, 4  # a step of depth, as a share of it, and how far around it counts as edge
 

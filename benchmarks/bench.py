@@ -18,7 +18,9 @@ os.environ.pop("OPENBLAS_CORETYPE", None)  # before numpy is loaded: it would ch
 import compute
 import encoders
 import inprocess
+import lidar
 import memory
+import mine
 from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
 from processes import Processes
 from table import Section, summary
@@ -39,10 +41,12 @@ class Plan:
     few: int = 200
     many: int = 10_000
     help_rounds: int = 11
+    lidar_rounds: int = 9
+    mine_rounds: int = 3
     distinct: int = 12
 
 
-QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 4)
+QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 4)
 
 METHOD = """\
 Jobs that are compared run in turn (A B C A B C …) after a warm-up round; every figure is the median of its
@@ -111,7 +115,9 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
     "processes": _processes,
     "memory": _simple(lambda p, space: memory.measure(space, p.distinct, p.few, p.many, p.memory_rounds)),
     "encoders": _simple(lambda plan, _: encoders.measure(plan.encode_rounds)),
-    "help": _simple(lambda plan, _: memory.measure_help(plan.help_rounds)),
+    "lidar": _simple(lambda plan, _: lidar.measure(plan.lidar_rounds)),
+    "mine": _simple(lambda plan, space: mine.measure(space, plan.mine_rounds)),
+    "help": _simple(lambda plan, space: memory.measure_start(space, plan.help_rounds)),
 }
 
 
@@ -133,7 +139,8 @@ def method(plan: Plan) -> str:
     rounds = (
         f"{plan.compute_rounds} rounds in memory, {plan.run_rounds} in one process,"
         f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders,"
-        f" {plan.memory_rounds} of memory, {plan.help_rounds} of start-up"
+        f" {plan.memory_rounds} of memory, {plan.lidar_rounds} of LiDAR, {plan.mine_rounds} of the mine,"
+        f" {plan.help_rounds} of start-up"
     )
     return METHOD.format(
         storage=storage().capitalize(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import lidar
 from content import Case
 from table import Row, Section, at_most
 from timing import Sample, interleaved
@@ -24,7 +25,7 @@ TEXT = """\
 Peak resident memory of the whole process (`ru_maxrss`) of `fusion blend` with two workers on pairs of
 160x120, {few} and {many} of them ({distinct} different ones, repeated as hard links)."""
 
-HELP_TEXT = "Whole process, warm disk cache."
+HELP_TEXT = "Whole processes, warm disk cache, machine code of the compiled loops cached."
 
 
 def measure(space: Workspace, distinct: int, few: int, many: int, rounds: int) -> Section:
@@ -54,7 +55,7 @@ def _mib(sample: Sample) -> str:
     return f"{sample.median:.0f} MiB"
 
 
-def measure_help(rounds: int) -> Section:
+def measure_start(space: Workspace, rounds: int) -> Section:
     taken = interleaved({"help": lambda: run_clocked([str(FUSION), "--help"])}, rounds, warm=2)["help"]
     blend = interleaved({"help": lambda: run_clocked([str(FUSION), "blend", "--help"])}, rounds, warm=1)[
         "help"
@@ -63,4 +64,5 @@ def measure_help(rounds: int) -> Section:
         Row("`fusion --help`", "", "", taken, at_most(HELP_TARGET_S, " s")),
         Row("`fusion blend --help`", "", "", blend, at_most(HELP_TARGET_S, " s")),
     ]
+    rows += lidar.measure_start(space, rounds)
     return Section("Start-up", HELP_TEXT, ("", ""), rows)

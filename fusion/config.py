@@ -115,7 +115,7 @@ def load_config(path: Path | None, overrides: Mapping[str, Any]) -> BlendConfig:
 
 def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
     preset = settings.get("preset", "auto")
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise UsageError(f"unknown preset {preset!r}", where=where, hint=f"one of: {', '.join(PRESETS)}")
     thermal = settings.get("thermal", {})
     if isinstance(thermal, Mapping) and "window" in thermal and "window_unit" not in thermal:

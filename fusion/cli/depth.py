@@ -83,7 +83,7 @@ def depth(
         str | None,
         Parameter(
             group=SAMPLES,
-            help="plane, natural, natural-discrete, linear, nearest, scan, guided. Default: plane.",
+            help="plane, plane-fast, scan, natural-discrete, natural, linear, nearest, guided.",
         ),
     ] = None,
     extrapolate: Annotated[

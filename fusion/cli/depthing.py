@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 from fusion.batch import in_order, opencv_on_one_thread, rows_of
 from fusion.cli.partners import Partners
 from fusion.cli.running import progress_bar, quiet_libraries, refuse_overlap, threads_of, warn
-from fusion.clouds import CloudFiles, clouds_in, read_cloud
+from fusion.clouds import READERS, CloudFiles, clouds_in, read_cloud
 from fusion.codecs import decode_image
+from fusion.colormaps import colormap_bgr
 from fusion.errors import FrameError, InputError, UsageError
+from fusion.frames import Image
 from fusion.lidar.config import DepthConfig, load_depth_config
+from fusion.lidar.densify import DENSIFIERS
 from fusion.lidar.lane import DepthFrame, DepthLane
 from fusion.lidar.score import Score, score
 from fusion.provenance import describe_depth
@@ -27,6 +30,7 @@ from fusion.rig import Rig
 from fusion.settings import nested
 from fusion.sinks.depth import KINDS, PER_METRE, DepthRow, DepthSink, quantised
 from fusion.sources import Role, Source, open_source
+from fusion.tables import lookup
 
 # option of the command -> its place in the configuration
 PLACES = {
@@ -83,14 +87,15 @@ def run_depth(
     overwrite: bool,
     quiet: bool,
 ) -> None:
-    _check(given, out)
+    _check(settings, given, out)
     threads = threads_of(workers)
     if out is not None:
         refuse_overlap(given.all(), out, tuple(KINDS))
     with quiet_libraries(), ExitStack() as open_things:
         job = DepthJob(settings, given, threads, open_things)
         if not quiet:
-            print("\n".join(plan_lines(job.lane, len(job), job.ignored)), flush=True)
+            plan = plan_lines(job.lane, len(job), job.ignored, pictures=given.sparse is not None)
+            print("\n".join(plan), flush=True)
         report = DepthReport()
         if out is None:
             _score_only(job, report, quiet)
@@ -107,17 +112,40 @@ def run_depth(
             raise InputError(f"no depth map could be made; the first, {stem!r}: {reason}")
         if not quiet and out is not None:
             print("\n".join(closing_lines(report, out)))
-        if given.score is not None:
+        if job.scores:
             print("\n".join(score_lines(job.scores)))
-        warn([*job.notes, *warnings_of(report)])
+        warn([*job.notes, *warnings_of(report, job.unscored)])
+    if given.score is not None and not job.scores:  # out here: the maps, if kept, are whole
+        raise InputError("no map could be scored", where=f"--score {given.score}")
 
 
-def _check(given: Given, out: Path | None) -> None:
+def _check(settings: DepthConfig, given: Given, out: Path | None) -> None:
+    """Refuse what cannot be meant, before anything is read or written."""
     if out is None and given.score is None:
         raise UsageError("no output folder", where="--out", hint="give -o OUT, or only --score TRUTH")
     if bool(given.clouds) == bool(given.sparse):
         hint = "fusion depth CLOUD… -o OUT, or fusion depth --sparse PNG|FOLDER -o OUT"
         raise UsageError("give either clouds or sparse pictures", hint=hint)
+    if given.sparse is not None:
+        _check_for_pictures(settings)
+    method = settings.dense.method
+    if method == "guided" and given.guide is None:
+        raise UsageError("--method guided looks at a picture", hint="give --guide RGB, or another --method")
+    if given.guide is not None and method in DENSIFIERS and method != "guided":
+        hint = "give --method guided, or no --guide"
+        raise UsageError(f"--method {method} looks at no guide", where="--guide", hint=hint)
+    colormap_bgr(settings.picture.colormap)
+    if settings.cloud.form is not None:
+        lookup(READERS, "fusion.clouds", settings.cloud.form, "form of point cloud")
+
+
+def _check_for_pictures(settings: DepthConfig) -> None:
+    for name, group in (("cloud", settings.cloud), ("camera", settings.camera)):
+        for key in sorted(group.model_fields_set):
+            hint = "leave it out: a sparse picture has its points and its camera"
+            raise UsageError(f"{name}.{key} means nothing here", where="--sparse", hint=hint)
+    if settings.samples.visibility == "map":
+        raise UsageError("a sparse picture is no map", where="--visibility", hint="scan or none")
 
 
 class DepthJob:
@@ -127,7 +155,7 @@ class DepthJob:
         self.strict = settings.strict
         self.lane = DepthLane(settings, _rig(settings, given))
         self.sink: DepthSink | None = None
-        self.scores: dict[str, Score] = {}
+        self._scores: dict[int, Score | str] = {}  # or why there is none
         self._clouds = _clouds(given.clouds)
         self._pictures = None if given.sparse is None else _opened(given.sparse, "fir", open_things)
         self._stems, self._files = self._names()
@@ -149,6 +177,15 @@ class DepthJob:
 
     def __len__(self) -> int:
         return len(self._stems)
+
+    @property
+    def scores(self) -> dict[str, Score]:
+        return {self._stems[i]: s for i, s in sorted(self._scores.items()) if isinstance(s, Score)}
+
+    @property
+    def unscored(self) -> dict[str, str]:
+        """Why maps that have a truth have no score."""
+        return {self._stems[i]: s for i, s in sorted(self._scores.items()) if isinstance(s, str)}
 
     @property
     def ignored(self) -> int:
@@ -186,9 +223,12 @@ class DepthJob:
     def frame(self, index: int) -> DepthFrame:
         """Read and densify one cloud, and score it where its truth is known."""
         stem, guide = self._stems[index], self._partner("guide", index)
-        options = {"guide_bgr": guide, "threads": self._inner_threads}
+        options = {
+            "guide_bgr": None if guide is None else guide.pixels,
+            "threads": self._inner_threads,
+        }
         if self._pictures is not None:
-            metres = _metres(self._pictures.read(index).pixels, self._files[index])
+            metres = _metres(self._pictures.read(index), self._files[index])
             frame = self.lane.of_image(metres, stem, **options)
         else:
             cloud = read_cloud(self._files[index], self.lane.config.cloud.form, stem)
@@ -201,25 +241,37 @@ class DepthJob:
         self._score(index, decode_image(path.read_bytes(), str(path)))
 
     def _score(self, index: int, map_counts: NDArray[Any]) -> None:
-        """As the benchmark does: the map as its file holds it against the truth's file."""
-        truth = self._partner("score", index)
-        if truth is None:
-            return
-        where = self._partners["score"].file(index)
-        truth_m, map_m = _metres(truth, where), _metres(map_counts, self._stems[index])
-        if truth_m.shape != map_m.shape:
-            size, true = (f"{w}x{h}" for h, w in (map_m.shape, truth_m.shape))
-            raise FrameError(f"the truth is {true}, the map {size}", where=where)
-        self.scores[self._stems[index]] = score(map_m, truth_m)
+        """As the benchmark does: the map as its file holds it against the truth's file.
+
+        A truth that cannot be used costs the score, not the map, unless the run is strict.
+        """
+        try:
+            truth = self._partner("score", index)
+            if truth is not None:
+                where = self._partners["score"].file(index)
+                self._scores[index] = _scored(map_counts, _metres(truth, where), where)
+        except FrameError as error:
+            if self.strict:
+                raise
+            self._scores[index] = error.what
 
     def _names(self) -> tuple[list[str], list[str]]:
         if self._pictures is not None:
             entries = self._pictures.entries
             return [entry.stem for entry in entries], [entry.file or entry.where for entry in entries]
         stems = [stem for files in self._clouds for stem in files.stems]
-        return stems, [str(path) for files in self._clouds for path in files]
+        paths = [str(path) for files in self._clouds for path in files]
+        first: dict[str, str] = {}
+        for stem, path in zip(stems, paths, strict=True):
+            if stem in first:
+                hint = (
+                    "maps bear the names of their clouds: give each once, or a folder above both as 'top/*/*'"
+                )
+                raise InputError(f"one name for two inputs: {first[stem]} and {path}", hint=hint)
+            first[stem] = path
+        return stems, paths
 
-    def _partner(self, name: str, index: int) -> NDArray[Any] | None:
+    def _partner(self, name: str, index: int) -> Image | None:
         """The image that goes with a frame; None where there is none, and the frame can do without."""
         partner = self._partners.get(name)
         if partner is None or (name != "guide" and not partner.has(index)):
@@ -253,7 +305,7 @@ def _clouds(specs: Sequence[str]) -> list[CloudFiles]:
 
 
 def _opened(spec: str, role: Role, open_things: ExitStack) -> Source:
-    source = open_source(spec, role)
+    source = open_source(spec, role, fir_colour="luma")  # which flags what was coloured: no depth
     open_things.callback(source.close)
     return source
 
@@ -274,18 +326,30 @@ def _size_of(spec: str | None) -> tuple[int, int] | None:
         return _opened(spec, "rgb", open_things).read(0).size_wh
 
 
-def _metres(pixels: NDArray[Any], where: str) -> NDArray[np.float32]:
+def _metres(image: Image, where: str) -> NDArray[np.float32]:
     """Depth PNG to metres. Raises `FrameError` for pictures that are none."""
-    if pixels.dtype != np.uint16:
-        hint = "16 bits, metres x 256, 0 = none, as KITTI has them"
-        raise FrameError("an 8-bit picture is no depth map", where=where, hint=hint)
-    return pixels.astype(np.float32) / np.float32(PER_METRE)
+    coloured = "fir-colour-to-luma" in image.flags
+    if coloured or image.pixels.dtype != np.uint16:
+        what = f"{'a coloured' if coloured else 'an 8-bit'} picture is no depth map"
+        raise FrameError(what, where=where, hint="16-bit grey, metres x 256, 0 = none, as KITTI has them")
+    return image.pixels.astype(np.float32) / np.float32(PER_METRE)
+
+
+def _scored(map_counts: NDArray[np.uint16], truth_m: NDArray[np.float32], where: str) -> Score:
+    if truth_m.shape != map_counts.shape:
+        size, true = (f"{w}x{h}" for h, w in (map_counts.shape, truth_m.shape))
+        raise FrameError(f"the truth is {true}, the map {size}", where=where)
+    found = score(map_counts.astype(np.float32) / np.float32(PER_METRE), truth_m)
+    if not found.count:
+        raise FrameError("no pixel has both a truth and a value", where=where)
+    return found
 
 
 def _overlay(
-    bgr: NDArray[np.uint8], frame: DepthFrame, colormap: str, show_m: tuple[float, float]
+    image: Image, frame: DepthFrame, colormap: str, show_m: tuple[float, float]
 ) -> NDArray[np.uint8]:
+    bgr: NDArray[Any] = image.pixels
     if bgr.shape[1::-1] != frame.sparse.size_wh:
-        size, image = (f"{w}x{h}" for w, h in (frame.sparse.size_wh, bgr.shape[1::-1]))
-        raise FrameError(f"the image for the overlay is {image}, the camera {size}", where=frame.stem)
+        size, ours = (f"{w}x{h}" for w, h in (frame.sparse.size_wh, bgr.shape[1::-1]))
+        raise FrameError(f"the image for the overlay is {ours}, the camera {size}", where=frame.stem)
     return overlay(bgr, frame.sparse, colormap, show_m)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from typing import Any
-
-from numpy.typing import NDArray
 
 from fusion.errors import FrameError, InputError
+from fusion.frames import Image
 from fusion.pairing import stamp_in_name
 from fusion.sources import Source
 
@@ -46,12 +44,12 @@ class Partners:
     def has(self, index: int) -> bool:
         return self._index[index] is not None
 
-    def read(self, index: int) -> NDArray[Any]:
-        """Its pixels. Raises `FrameError` where it has none, or they cannot be read."""
+    def read(self, index: int) -> Image:
+        """The partner itself. Raises `FrameError` where there is none, or it cannot be read."""
         partner = self._index[index]
         if partner is None:
             raise FrameError(f"no image in {self.option} belongs to it")
-        return self._source.read(partner).pixels
+        return self._source.read(partner)
 
 
 def _matched(stems: Sequence[str], source: Source) -> list[int | None]:

@@ -40,6 +40,8 @@ def refuse_overlap(inputs: Sequence[str], out: Path, folders: Sequence[str]) -> 
     for spec in inputs:
         folder = fixed_folder(spec)
         if folder is None:
+            if any(target / name in Path(spec).resolve().parents for name in folders):
+                raise OutputError(f"would overwrite the input {spec}", where=out, hint="choose another -o")
             continue
         if target == folder or folder in target.parents:
             raise OutputError("lies inside the input folder", where=out, hint="choose another -o")

@@ -84,6 +84,12 @@ def _plane(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
     return plane(sparse, threads=demand.threads)
 
 
+def _plane_fast(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
+    from fusion.lidar.plane import plane
+
+    return plane(sparse, robust=False, threads=demand.threads)
+
+
 def _guided(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
     from fusion.lidar.guided import guided
 
@@ -96,6 +102,7 @@ def _guided(sparse: SparseDepth, demand: Demand) -> NDArray[np.float32]:
 
 DENSIFIERS: dict[str, Fill] = {
     "plane": _plane,
+    "plane-fast": _plane_fast,
     "natural": _scattered("natural"),
     "natural-discrete": _natural_discrete,
     "linear": _scattered("linear"),

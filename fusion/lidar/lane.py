@@ -20,6 +20,7 @@ from fusion.lidar.rings import rings_of
 from fusion.lidar.sparse import DenseDepth, SparseDepth, Value
 from fusion.rig import Rig
 
+MOST_IN_MAP = 5_000_000  # a normal a point takes a search among all
 FEW = 0.02  # a smaller share than this left at one step is what went wrong
 
 
@@ -112,6 +113,9 @@ class DepthLane:
     def _seen_in_map(self, cloud: PointCloud) -> NDArray[np.bool_]:
         from fusion.lidar.surfels import surfels_of, visible_in_map
 
+        if len(cloud) > MOST_IN_MAP:
+            hint = f"at most {MOST_IN_MAP:,}: --voxel METRES, or --visibility none"
+            raise FrameError(f"{len(cloud):,} points are too many to find the hidden ones", hint=hint)
         discs = surfels_of(cloud)
         normal = discs.normal @ self.T_cam_lidar[:3, :3].T.astype(np.float32)
         return visible_in_map(transform(self.T_cam_lidar, cloud.xyz_m), self.camera, normal, discs.radius_m)

@@ -41,6 +41,8 @@ def circumcentres(corner, x, y, centre):
         a, b, c = corner[3 * t + base], corner[3 * t + (base + 1) % 3], corner[3 * t + (base + 2) % 3]
         ax, ay, bx, by = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
         a2, b2, d = ax * ax + ay * ay, bx * bx + by * by, 2 * (ax * by - ay * bx)
+        if d == 0:  # three on one line, by rounding: the centre is far away
+            d = 1e-12 * shortest
         centre[t, 0], centre[t, 1] = x[a] + (by * a2 - ay * b2) / d, y[a] + (ax * b2 - bx * a2) / d
 
 

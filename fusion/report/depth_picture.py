@@ -10,7 +10,7 @@ from fusion.colormaps import colormap_bgr
 from fusion.lidar.sparse import SparseDepth
 
 NONE_GREY, PAPER, INK = 96, 255, (32, 32, 32)
-BAR_WIDTH, BAR_GAP, LABEL_WIDTH = 18, 10, 52
+BAR_WIDTH, BAR_GAP, LABEL_WIDTH = 18, 10, 76
 FONT_PX, LEAST_HEIGHT = 14, 120
 
 

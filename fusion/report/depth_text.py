@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -55,25 +55,25 @@ class DepthReport:
             self.poor.append(f"{row.stem}: {cause}")
 
 
-def plan_lines(lane: DepthLane, inputs: int, ignored: int) -> list[str]:
-    """What will be done, before the first cloud."""
-    config, (w, h) = lane.config, lane.camera.size_wh
-    rig = config.camera.rig
-    camera = (
-        f"{config.camera.model}, {config.camera.fov_deg:g} degrees"
-        if rig is None
-        else f"{rig}, {config.camera.sensor}"
-    )
-    dense, samples = config.dense, config.samples
+def plan_lines(lane: DepthLane, inputs: int, ignored: int, *, pictures: bool = False) -> list[str]:
+    """What will be done, before the first cloud, or the first of sparse `pictures`."""
+    dense, samples = lane.config.dense, lane.config.samples
     gap = "by spacing" if dense.max_gap_px is None else f"{dense.max_gap_px:g} px"
     rows = [
         ("inputs", f"{inputs}" + (f", and {ignored} other files ignored" if ignored else "")),
-        ("camera", f"{camera}, {w}x{h}"),
+        ("camera", "that of the pictures" if pictures else _camera_line(lane)),
         ("value", f"{lane.value}, {samples.limits_m[0]:g} to {samples.limits_m[1]:g} m"),
         ("visibility", samples.visibility),
         ("method", f"{dense.method}, largest gap {gap}, extrapolation {dense.extrapolate}"),
     ]
     return table(rows)
+
+
+def _camera_line(lane: DepthLane) -> str:
+    camera, (w, h) = lane.config.camera, lane.camera.size_wh
+    if camera.rig is not None:
+        return f"{camera.rig}, {camera.sensor}, {w}x{h}"
+    return f"{camera.model}, {camera.fov_deg:g} degrees, {w}x{h}"
 
 
 def closing_lines(report: DepthReport, out: Path) -> list[str]:
@@ -95,21 +95,26 @@ def closing_lines(report: DepthReport, out: Path) -> list[str]:
     return table(rows)
 
 
-def warnings_of(report: DepthReport) -> list[str]:
-    """What the user should act on, a line each."""
-    skipped = [f"skipped {stem}: {reason}" for stem, reason in report.skipped[:LOUD_SKIPS]]
-    if len(report.skipped) > LOUD_SKIPS:
-        skipped.append(f"… and {len(report.skipped) - LOUD_SKIPS} more, all named in frames.csv")
-    poor = report.poor[:LOUD_SKIPS]
-    if len(report.poor) > LOUD_SKIPS:
-        poor.append(f"… and {len(report.poor) - LOUD_SKIPS} more with little left")
-    return [*skipped, *poor]
+def warnings_of(report: DepthReport, unscored: Mapping[str, str]) -> list[str]:
+    """What the user should act on, a line each; `unscored` says of maps why they have no score."""
+    skipped = [f"skipped {stem}: {reason}" for stem, reason in report.skipped]
+    without = [f"{stem} is not scored: {reason}" for stem, reason in unscored.items()]
+    return [
+        *_loudest(skipped, "all named in frames.csv"),
+        *_loudest(report.poor, "with little left"),
+        *_loudest(without, "without a score"),
+    ]
+
+
+def _loudest(lines: Sequence[str], which: str) -> list[str]:
+    more = len(lines) - LOUD_SKIPS
+    return [*lines[:LOUD_SKIPS], *([f"… and {more} more, {which}"] if more > 0 else [])]
 
 
 def score_lines(scores: Mapping[str, Score]) -> list[str]:
     """The errors of every map and, last, their means over the images, as the KITTI benchmark counts them."""
     head = ("map", "RMSE mm", "MAE mm", "iRMSE 1/km", "iMAE 1/km", "coverage")
-    lines = [(stem, *_cells(one)) for stem, one in sorted(scores.items())]
+    lines = [(stem, *_cells(one)) for stem, one in scores.items()]
     if len(scores) > 1:
         lines.append(("mean", *_cells(mean_score(list(scores.values())))))
     widths = [max(len(line[k]) for line in (head, *lines)) for k in range(len(head))]

@@ -26,6 +26,7 @@ from fusion.lidar.sparse import SparseDepth
 from fusion.sinks.run_folder import RunFolder, inside
 
 PER_METRE = 256
+COUNTS = ("read", "finite", "in_front", "in_frame", "in_range", "visible", "covered", "supported", "pixels")
 KINDS = {"depth": ".png", "support": ".png", "sparse": ".npz", "picture": ".png", "overlay": ".png"}
 
 
@@ -85,7 +86,7 @@ class DepthRow:
 
     @classmethod
     def skipped(cls, stem: str, error: FrameError) -> DepthRow:
-        return cls(stem, "skipped", reason=error.what)
+        return cls(stem, "skipped", reason=f"{error.what} ({error.hint})" if error.hint else error.what)
 
 
 class DepthSink(RunFolder[DepthRow]):
@@ -114,8 +115,12 @@ class DepthSink(RunFolder[DepthRow]):
         return DepthRow.made(frame, {kind: len(content) for kind, content in data.items()})
 
     def files(self, row: DepthRow) -> Mapping[Path, int]:
+        """Raises `ValueError` for a row that is not ours: what it stands for is made again."""
+        if not all(getattr(row, name).isdecimal() for name in COUNTS):
+            raise ValueError(f"expected counts, got {row}")
         sizes = {kind: getattr(row, f"{kind}_size") for kind in KINDS}
-        return {self._path(kind, row.stem): int(size) for kind, size in sizes.items() if size}
+        needed = {kind: size for kind, size in sizes.items() if size or kind != "overlay"}
+        return {self._path(kind, row.stem): int(size) for kind, size in needed.items()}
 
     def paths(self, stem: str) -> Iterable[Path]:
         return [self._path(kind, stem) for kind in KINDS]

@@ -57,6 +57,7 @@ class RunFolder(ABC, Generic[RowT]):
         self._done: dict[str, RowT] = {}
         self._rows: list[RowT] = []
         self._lock_fd: int | None = None
+        self._was_there = True
 
     @abstractmethod
     def files(self, row: RowT) -> Mapping[Path, int]:
@@ -81,6 +82,9 @@ class RunFolder(ABC, Generic[RowT]):
         try:
             if kind is None:
                 self._complete()
+            else:
+                with suppress(OSError):  # the error that brought us here is the one to tell
+                    self._withdraw()
         except OSError as error:
             raise output_error(error, self.out) from None
         finally:
@@ -137,6 +141,7 @@ class RunFolder(ABC, Generic[RowT]):
     def _open(self) -> None:
         if self.out.exists() and not self.out.is_dir():
             raise OutputError("is a file, not a folder", where=self.out, hint="choose another -o")
+        self._was_there = self.out.exists()
         self.out.mkdir(parents=True, exist_ok=True)
         self._lock()
         journal, index = self._partial / "journal.csv", self.out / "frames.csv"
@@ -164,10 +169,10 @@ class RunFolder(ABC, Generic[RowT]):
             raise OutputError("another run is writing here", where=self.out, hint="wait for it") from None
 
     def _refuse_another_run(self, rows: list[RowT]) -> None:
-        path = self.out / "run.toml"
+        path, frames = self.out / "run.toml", any((self.out / self.main_folder).glob("*"))
         hint = "choose another -o, or pass --overwrite to replace that run's frames"
         if not path.exists():
-            if rows or any((self.out / self.main_folder).glob("*")):
+            if frames or (self.out / "frames.csv").exists():
                 raise OutputError(
                     "holds frames, but no run.toml that says whose they are", where=self.out, hint=hint
                 )
@@ -176,6 +181,8 @@ class RunFolder(ABC, Generic[RowT]):
             before = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
         except (ValueError, TOMLKitError) as error:
             raise OutputError(f"its run.toml cannot be read: {error}", where=self.out, hint=hint) from None
+        if before.get("format") == RUN_FORMAT and not (frames or any(row.done for row in rows)):
+            return  # it came to nothing: there is nothing to protect
         difference = first_difference(before, self._run)
         if difference:
             raise OutputError(f"holds another run ({difference})", where=self.out, hint=hint)
@@ -193,6 +200,19 @@ class RunFolder(ABC, Generic[RowT]):
         if self._journal is not None:
             self._journal.close()
         shutil.rmtree(self._partial)
+
+    def _withdraw(self) -> None:
+        """After an error, if not one frame was made: leave nothing that would stand in the next run's way."""
+        main = self.out / self.main_folder
+        left = {path.name for path in self.out.iterdir()} - {"run.toml", ".partial", self.main_folder}
+        if left or (main.exists() and any(main.iterdir())):
+            return
+        shutil.rmtree(self._partial, ignore_errors=True)
+        (self.out / "run.toml").unlink(missing_ok=True)
+        if main.exists():
+            main.rmdir()
+        if not self._was_there:
+            self.out.rmdir()
 
     def _close(self) -> None:
         if self._journal is not None:

@@ -535,3 +535,13 @@ def test_a_coarser_step_is_near_the_finer_one() -> None:
         assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.05 * step
     cell = natural_discrete([1.0], [2.0], [3.0], (5, 5), step=9)
     assert (cell == 3).all()
+
+
+def test_triangles_without_area_are_no_division_by_zero() -> None:
+    """Points in rows, as a flat wall gives them: rounding leaves triangles of three on one line."""
+    k = np.arange(40)
+    u, v = 320 - 37 * k * 0.1 / 5, 240 - 37 * (k % 5) * 0.3 / 5
+    value = np.full(40, 5.0)
+    dense, inside = interpolate(u, v, value, (640, 480), method="natural", extrapolate="none")
+    assert inside.any()
+    np.testing.assert_allclose(dense[inside], 5.0, rtol=1e-6)

@@ -231,7 +231,7 @@ def load_mine_config(path: Path | None, overrides: Mapping[str, Any] | None = No
 
 def _validated(settings: Mapping[str, Any], where: str) -> MineConfig:
     preset = settings.get("preset", "clear")
-    if preset not in PRESETS:
+    if not isinstance(preset, str) or preset not in PRESETS:
         raise UsageError(f"unknown preset {preset!r}", where=where, hint=f"one of: {', '.join(PRESETS)}")
     try:
         whole = merged(merged(MineConfig().model_dump(), PRESETS[preset]), settings)
