@@ -19,9 +19,10 @@ RATE_HZ = 10.0
 MEMORY_S = (1.0, 4.0)
 
 TEXT = """\
-`make_mine` with truth, two threads, all three sensors at {rate:g} Hz (640x480 + 640x512 + 64x1024): the time of a
-set is that of {long:g} s of recording less that of {short:g} s, a set each 0.1 s, so that building the scene is
-not in it. Memory is the peak of `fusion simulate mine` for {least:g} and {most:g} s at the default rates."""
+`make_mine` with truth, two threads, all three sensors at {rate:g} Hz (640x480 + 640x512 + 64x1024): the time
+of a set is that of {long:g} s of recording less that of {short:g} s, a set each 0.1 s, so that building the
+scene is not in it. Memory is the peak of `fusion simulate mine` for {least:g} and {most:g} s at the default
+rates."""
 
 
 def measure(space: Workspace, rounds: int) -> Section:

@@ -46,14 +46,16 @@ def project_pinhole(xyz, T, camera, size, limits, use_range, first, u, v, value,
 def nearest_of_pixels(u, v, value, image):
     """The z-buffer: the least value of every pixel into `image` (0: none); how many samples lie outside."""
     h, w = image.shape
+    pixels = image.reshape(-1)
+    right, bottom = w - 0.5, h - 0.5
     outside = 0
     for i in range(u.size):
-        if not (-0.5 <= u[i] < w - 0.5 and -0.5 <= v[i] < h - 0.5):
+        if not (-0.5 <= u[i] < right and -0.5 <= v[i] < bottom):
             outside += 1
             continue
         # Not negative. The sum may round up to the size: 0.49999999999999994 + 0.5 is 1.
         column, row = min(np.int64(u[i] + 0.5), w - 1), min(np.int64(v[i] + 0.5), h - 1)
-        held = image[row, column]
-        if held == 0 or value[i] < held:
-            image[row, column] = value[i]
+        pixel = np.uint64(row * w + column)
+        held = pixels[pixel]
+        pixels[pixel] = value[i] if held == 0 or value[i] < held else held
     return outside
