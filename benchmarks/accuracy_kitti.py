@@ -115,7 +115,7 @@ def _cases(data: Path) -> dict[str, list[Case]]:
 
 
 def _held_out(folder: Path) -> Iterator[Case]:
-    picture = cv2.imread(str(folder / "image_2" / "000000.png"))
+    picture = np.asarray(cv2.imread(str(folder / "image_2" / "000000.png")))
     rig = read_rig(folder / "calib" / "000000.txt", picture.shape[1::-1])
     cloud = read_cloud(folder / "velodyne" / "000000.bin")
     sparse = project(cloud, rig.camera("rgb"), rig.pose("rgb", "lidar"), limits_m=(1.0, 255.0))
@@ -138,7 +138,7 @@ def _seen(sparse: SparseDepth) -> SparseDepth:
 
 
 def _metres(path: Path) -> NDArray[np.float32]:
-    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(256)
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)).astype(np.float32) / np.float32(256)
 
 
 def _rings_of_picture(

@@ -161,10 +161,10 @@ def _view(xyz: NDArray[Any], surfels: Surfels, T: Floats) -> tuple[SparseDepth, 
 
 
 def _at_edge(sparse: SparseDepth, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     uv = np.stack([sparse.u, sparse.v], 1)
-    around = cKDTree(uv).query_ball_point(uv[which], EDGE_PX)
+    around = KDTree(uv).query_ball_point(uv[which], EDGE_PX)
     z = sparse.value_m
     return np.array([np.ptp(z[k]) > EDGE_M + EDGE_SHARE * z[k].min() for k in around], np.bool_)
 
@@ -178,13 +178,13 @@ def _guided_section(folder: Path) -> str:
     guide = np.asarray(cv2.imread(str(folder / "image.png")), np.uint8)
     lines = []
     for method in ("guided", "plane", "natural-discrete"):
-        cells = []
+        cells, verdict = [], ""
         for count in (1000, 100, 10):
             rmse, mae = _rmse_mae(_sparse_error(method, _thinned(samples, count), truth, guide))
             cells.append(f"{rmse:.2f} / {mae:.2f}")
             if (method, count) == ("guided", 1000):
                 verdict = "met" if at_most(WANTED_GUIDED_M).met(rmse) else "**missed**"
-        lines.append([f"`{method}`", *cells, verdict if method == "guided" else ""])
+        lines.append([f"`{method}`", *cells, verdict])
     text = GUIDED_TEXT.format(wanted=WANTED_GUIDED_M)
     return f"{title}\n\n{text}\n\n{grid(('method', '1000', '100', '10', 'verdict'), lines)}"
 

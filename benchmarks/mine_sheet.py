@@ -71,7 +71,9 @@ def _row(preset: str, start_s: float, more: dict[str, Any], seed: int) -> NDArra
         truth, depth = Truth(out), DepthLane(rig=Truth(out).rig)
         stamp = truth.stamps("rgb")[1]
         bgr = cv2.imread(str(out / "rgb" / f"{stamp}.jpg"))
-        fir = cv2.imread(str(out / "fir" / f"{truth.stamps('fir')[1]}.png"), cv2.IMREAD_UNCHANGED)
+        fir = np.asarray(
+            cv2.imread(str(out / "fir" / f"{truth.stamps('fir')[1]}.png"), cv2.IMREAD_UNCHANGED), np.uint16
+        )
         samples = depth.of_cloud(read_cloud(next(iter(clouds_in(out / "lidar"))))).sparse
         pictures = [
             bgr,

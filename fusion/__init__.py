@@ -1,4 +1,4 @@
-"""RGB and thermal (later LiDAR) recordings become fused frames that a tracker can live on.
+"""RGB, thermal and LiDAR recordings become fused frames and metric depth that a tracker can live on.
 
     from fusion import Fuser, open_pairs
 
@@ -15,13 +15,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fusion.batch import run
+    from fusion.clouds import read_cloud
     from fusion.colormaps import colormap_bgr
     from fusion.config import BlendConfig
     from fusion.errors import FrameError, FusionError, InputError, OutputError, UsageError
-    from fusion.frames import FrameSet, FusedFrame, Image, Window
+    from fusion.frames import FrameSet, FusedFrame, Image, PointCloud, Window
+    from fusion.lidar.config import DepthConfig
+    from fusion.lidar.lane import DepthLane
     from fusion.pairing import PairingRule
     from fusion.pipeline import Fuser
     from fusion.provenance import describe_run
+    from fusion.rig import Rig, load_rig
     from fusion.sinks.folder import FolderSink
     from fusion.sync import open_pairs
     from fusion.thermal import WindowRule
@@ -29,6 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BlendConfig",
+    "DepthConfig",
+    "DepthLane",
     "FolderSink",
     "FrameError",
     "FrameSet",
@@ -39,25 +45,33 @@ __all__ = [
     "InputError",
     "OutputError",
     "PairingRule",
+    "PointCloud",
+    "Rig",
     "UsageError",
     "Warp",
     "Window",
     "WindowRule",
     "colormap_bgr",
     "describe_run",
+    "load_rig",
     "open_pairs",
+    "read_cloud",
     "run",
 ]
 
 _HOMES = {
     "batch": ("run",),
+    "clouds": ("read_cloud",),
     "colormaps": ("colormap_bgr",),
     "config": ("BlendConfig",),
     "errors": ("FrameError", "FusionError", "InputError", "OutputError", "UsageError"),
-    "frames": ("FrameSet", "FusedFrame", "Image", "Window"),
+    "frames": ("FrameSet", "FusedFrame", "Image", "PointCloud", "Window"),
+    "lidar.config": ("DepthConfig",),
+    "lidar.lane": ("DepthLane",),
     "pairing": ("PairingRule",),
     "pipeline": ("Fuser",),
     "provenance": ("describe_run",),
+    "rig": ("Rig", "load_rig"),
     "sinks.folder": ("FolderSink",),
     "sync": ("open_pairs",),
     "thermal": ("WindowRule",),

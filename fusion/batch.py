@@ -21,8 +21,8 @@ from fusion.errors import FrameError, InputError
 from fusion.sinks.index import IndexRow, Row
 
 if TYPE_CHECKING:
+    from fusion.frames import FusedFrame
     from fusion.pipeline import Fuser
-    from fusion.sinks.folder import FolderSink
 
 IN_FLIGHT_PER_WORKER = 3
 T = TypeVar("T")
@@ -125,10 +125,18 @@ def rows_of(job: Job[RowT], sink: Sink[RowT], workers: int = 1) -> Iterator[tupl
             yield row, kept
 
 
+class FusedSink(Sink[Row], Protocol):
+    """A sink of fused frames; `write` may be called from several threads."""
+
+    def write(self, frame: FusedFrame, fir_stem: str) -> Row:
+        """Store one frame and return its row of the index. Raises `OutputError`."""
+        ...
+
+
 class FuseJob:
     """The pairs of a `Fuser` into a folder of fused frames."""
 
-    def __init__(self, fuser: Fuser, sink: FolderSink) -> None:
+    def __init__(self, fuser: Fuser, sink: FusedSink) -> None:
         self.fuser, self.sink, self.strict = fuser, sink, fuser.config.strict
 
     def __len__(self) -> int:
@@ -149,7 +157,7 @@ class FuseJob:
 
 def run(
     fuser: Fuser,
-    sink: FolderSink,
+    sink: FusedSink,
     *,
     workers: int = 1,
     progress: Callable[[int, int], None] = no_progress,

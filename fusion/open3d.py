@@ -17,7 +17,8 @@ def load() -> Any:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        hint = "pip install open3d-cpu; Debian: apt-get install libgomp1 libx11-6 libgl1 libegl1 libusb-1.0-0"
+        packages = "libegl1 libgl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0"
+        hint = f"pip install open3d-cpu; on Debian: apt-get install {packages}"
         raise FusionError(f"Open3D cannot be loaded: {error}", hint=hint) from None
     return open3d
 

@@ -6,6 +6,7 @@ import io
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -524,7 +525,8 @@ def test_16_bit_png_keeps_every_value(
         monkeypatch.setattr(png16, "isal_zlib", None)
     pixels = np.random.default_rng(0).integers(0, 65536, shape).astype(np.uint16)
     data = encode_png(pixels)
-    assert np.array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+    back: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(back, pixels)
     assert np.array_equal(decode_image(data, ""), pixels)
 
 

@@ -15,9 +15,11 @@ from cyclopts import CoercionError, MissingArgumentError
 
 from fusion.blend import blender
 from fusion.cli.blending import PLACES
+from fusion.cli.depthing import PLACES as DEPTH_PLACES
 from fusion.cli.main import app
 from fusion.colormaps import colormap_bgr
 from fusion.config import BlendConfig, load_config
+from fusion.lidar.config import DepthConfig, load_depth_config
 from tests.worlds import read, write_pairs
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +30,7 @@ DOCUMENTS = [
     ROOT / "datasets" / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
+SPOKEN_OF = {"depth.md": "fusion depth cloud.pcd", "mine.md": "fusion simulate mine mine/"}
 SHELLS = ("", "sh", "bash", "console")
 
 
@@ -126,7 +129,7 @@ def spoken(document: Path) -> Iterator[str]:
         if span.startswith("fusion "):
             yield span
         elif span.startswith("--"):
-            yield f"fusion blend rgb/ fir/ {span}"
+            yield f"{SPOKEN_OF.get(document.name, 'fusion blend rgb/ fir/')} {span}"
 
 
 def parse(line: str) -> None:
@@ -139,11 +142,14 @@ def test_every_command_shown_is_one(document: Path) -> None:
         parse(line)
 
 
-OPTIONS = {
-    name
-    for argument in app["blend"].assemble_argument_collection(default_parameter=app.default_parameter)
-    for name in argument.names
-}
+def options_of(*command: str) -> set[str]:
+    arguments = app[command[0]] if len(command) == 1 else app[command[0]][command[1]]
+    collected = arguments.assemble_argument_collection(default_parameter=app.default_parameter)
+    return {name for argument in collected for name in argument.names}
+
+
+OPTIONS = options_of("blend")
+ALL_OPTIONS = OPTIONS | options_of("depth") | options_of("simulate", "mine")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
@@ -156,7 +162,7 @@ def test_every_command_spoken_of_could_be_one(document: Path) -> None:
         except (MissingArgumentError, CoercionError) as error:
             if isinstance(error, CoercionError) and not any(word.isupper() for word in words):
                 raise
-            assert {word for word in words if word.startswith("-")} <= OPTIONS, line
+            assert {word for word in words if word.startswith("-")} <= ALL_OPTIONS, line
 
 
 def test_the_readme_shows_enough_to_be_worth_parsing() -> None:
@@ -215,6 +221,37 @@ def test_the_documented_configuration_is_one(tmp_path: Path) -> None:
     colormap_bgr(config.thermal.colormap)
     blender(config.blend.method)
     assert config.warp.homography == str(tmp_path / "H.toml")
+
+
+def depth_block() -> str:
+    (text,) = (block.text for block in blocks(ROOT / "docs" / "depth.md") if block.language == "toml")
+    return text
+
+
+def test_the_documented_depth_configuration_is_one_and_whole(tmp_path: Path) -> None:
+    """Every setting stands in its table, in use or in a comment; what can be is the default."""
+    path = tmp_path / "depth.toml"
+    path.write_text(depth_block(), encoding="utf-8")
+    config, defaults = load_depth_config(path, {}), DepthConfig.of()
+    for table in ("cloud", "camera", "samples", "dense", "picture"):
+        shown, group = tomllib.loads(depth_block())[table], getattr(config, table)
+        part = depth_block().split(f"[{table}]")[1].split("\n[")[0]
+        commented = re.findall(r"^# (\w+) = ", part, re.MULTILINE)
+        assert {*shown, *commented} == set(type(group).model_fields), table
+        for key in set(shown) - {"form", "range_m", "box_m", "voxel_m", "outliers", "max_gap_px"}:
+            known = getattr(getattr(defaults, table), key)
+            if known is not None:
+                assert getattr(group, key) == pytest.approx(known, abs=0.01), key
+
+
+def test_every_depth_option_has_its_place_and_every_documented_preset_is_true() -> None:
+    config = DepthConfig.of(preset="thesis")
+    row = ["`thesis`", config.samples.value, config.samples.visibility, f"`{config.dense.method}`"]
+    assert f"| {' | '.join([*row, config.dense.extrapolate])} |" in prose(ROOT / "docs" / "depth.md")
+    for option, place in DEPTH_PLACES.items():
+        assert f"--{option.replace('_', '-')}" in options_of("depth"), option
+        group = DepthConfig.model_fields if len(place) == 1 else type(getattr(config, place[0])).model_fields
+        assert place[-1] in group, option
 
 
 def commented_settings() -> list[tuple[str, str]]:

@@ -166,7 +166,7 @@ def test_more_samples_than_can_be_triangulated_are_refused(monkeypatch: pytest.M
 def test_no_sample_and_no_such_method() -> None:
     with pytest.raises(FrameError, match="no sample"):
         densify(samples([], [], []), "nearest")
-    with pytest.raises(UsageError, match=r"unknown method 'poisson' \(one of: plane, natural"):
+    with pytest.raises(UsageError, match=r"unknown method 'poisson' \(one of: plane, plane-fast, natural"):
         densifier("poisson")
     with pytest.raises(UsageError, match="--guide"):
         densify(spread(), "guided")
