@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion.errors import UsageError
 from fusion.frames import PointCloud
 from fusion.geometry import T_CAM_LIDAR, Camera, Floats, PinholeCamera, checked_pose, transform
-from fusion.kernels import read_only, scratch
+from fusion.kernels import read_only
 from fusion.lidar.kernels import nearest_of_pixels, project_pinhole
 from fusion.lidar.sparse import SparseDepth, Value
 
@@ -124,9 +124,8 @@ def _through_pinhole(
     first: int,
     counts: NDArray[np.int64],
 ) -> Samples:
-    # Room for all points is kept by the thread: fresh memory for each cloud costs more than the projection.
-    u, v, index = (scratch(f"project.{name}", (len(xyz),), np.float64) for name in ("u", "v", "index"))
-    values, index = scratch("project.values", (len(xyz),), np.float32), index.view(np.int64)
+    n = len(xyz)
+    u, v, values, index = np.empty(n), np.empty(n), np.empty(n, np.float32), np.empty(n, np.int64)
     # One type for each argument, whatever was given: every other one would be compiled anew.
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     size = (int(camera.size_wh[0]), int(camera.size_wh[1]))
@@ -145,7 +144,7 @@ def _through_pinhole(
         index,
         counts,
     )
-    return u[:kept].copy(), v[:kept].copy(), values[:kept].copy(), index[:kept].copy()
+    return u[:kept], v[:kept], values[:kept], index[:kept]
 
 
 def _through_model(
