@@ -98,8 +98,9 @@ def _guarded() -> int:
         return _complain(f"{' '.join(str(error).split())} (fusion COMMAND --help shows the options)", USAGE)
     except FusionError as error:
         return _complain(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        return _complain("interrupted; the same command goes on where this one stopped", INTERRUPTED)
+    except KeyboardInterrupt as stopped:
+        goes_on = "the same command goes on where this one stopped"
+        return _complain(f"interrupted; {stopped.args[0] if stopped.args else goes_on}", INTERRUPTED)
     except MemoryError:
         return _complain("out of memory (try fewer --workers)", 1)
     except BrokenPipeError:

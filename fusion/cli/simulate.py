@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -51,7 +53,7 @@ def simulate_mine(
         flight=flight,
         lidar=_given(rings=rings),
     )
-    with progress_bar("filming", quiet) as progress:
+    with _once(out), progress_bar("filming", quiet) as progress:
         report = make_mine(out, settings, progress=progress, threads=threads_of(workers))
     if not quiet:
         print(
@@ -84,10 +86,19 @@ def simulate_session(
         else {name: getattr(printed, name) for name in ("kind", "cols", "rows", "square_m")}
     )
     settings = _settings(config, seed=seed, board={**shown, **_given(poses=poses)})
-    with progress_bar("filming", quiet) as progress:
+    with _once(out), progress_bar("filming", quiet) as progress:
         report = make_session(out, settings, progress=progress)
     if not quiet:
         print(f"{report.rgb} poses of a {settings.board.kind} in {out}: rgb/, fir/, lidar/ and truth/")
+
+
+@contextmanager
+def _once(out: Path) -> Iterator[None]:
+    """Says, when interrupted, that a simulation starts afresh."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{out} is incomplete: delete it, a simulation starts afresh") from None
 
 
 def _settings(config: Path | None, **options: Any) -> Any:

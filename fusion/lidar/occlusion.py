@@ -46,7 +46,7 @@ def occluded(sparse: SparseDepth) -> NDArray[np.bool_]:
     image[image == 0] = np.inf
     padded = np.pad(image, ((y, y), (x, x)), constant_values=np.inf)
     beside, over = _least(padded, x, 2 * y + 1), _least(padded, 2 * x + 1, y)
-    columns, rows = np.rint(sparse.u).astype(np.intp), np.rint(sparse.v).astype(np.intp)
+    columns, rows = (np.floor(a + 0.5).astype(np.intp) for a in (sparse.u, sparse.v))  # as z_buffer
     limit = sparse.value_m - (NEARER_M + NEARER_SHARE * sparse.value_m)
     left, right = beside[rows, columns] < limit, beside[rows, columns + x + 1] < limit
     return left & right & (over[rows, columns] < limit)
@@ -77,7 +77,7 @@ def spacing_px(sparse: SparseDepth, image_m: NDArray[np.float32] | None = None) 
     image = z_buffer(sparse) if image_m is None else image_m
     even = min((image.size / max(len(sparse), 1)) ** 0.5, 4 * FARTHEST_PX)
     step = -(-len(sparse) // LOOKED_AT) or 1
-    columns, rows = (np.rint(a[::step]).astype(np.int64) for a in (sparse.u, sparse.v))
+    columns, rows = (np.floor(a[::step] + 0.5).astype(np.int64) for a in (sparse.u, sparse.v))
     gaps = np.full((2, max(len(rows), 1)), np.inf)
     plane_kernels.gaps_px(read_only(image), read_only(rows), read_only(columns), FARTHEST_PX, gaps)
     return SpacingPx(*(_typical(gap, even) for gap in gaps))

@@ -88,7 +88,7 @@ def _reach(reach: tuple[float, float], spacing: SpacingPx, step: int = 1) -> tup
 
 def _samples(sparse: SparseDepth, image: _Map, stretch: float) -> _Samples:
     """The nearest sample of each pixel, from the top row down."""
-    columns, rows = np.rint(sparse.u).astype(np.intp), np.rint(sparse.v).astype(np.intp)
+    columns, rows = (np.floor(a + 0.5).astype(np.intp) for a in (sparse.u, sparse.v))  # as z_buffer
     nearest = np.flatnonzero(sparse.value_m <= image[rows, columns])
     order = nearest[np.argsort(sparse.v[nearest], kind="stable")]
     stretch = min(max(stretch, 1 / MOST_STRETCHED), MOST_STRETCHED)

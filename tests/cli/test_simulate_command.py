@@ -103,3 +103,16 @@ def test_a_folder_in_use_is_refused(fusion: Fusion, tmp_path: Path) -> None:
     assert answer.code == 1
     assert "not empty" in answer.err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_ctrl_c_does_not_promise_to_go_on(
+    fusion: Fusion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fusion.simulate.mine.recording.make_mine", stopped)
+    answer = fusion("simulate", "mine", tmp_path / "mine", "--quiet")
+    assert answer.code == 130
+    assert "starts afresh" in answer.err
+    assert "goes on" not in answer.err

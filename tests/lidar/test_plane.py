@@ -15,8 +15,8 @@ from fusion.lidar import plane as module
 from fusion.lidar import plane_kernels as kernels
 from fusion.lidar.discrete import natural_discrete
 from fusion.lidar.occlusion import visible_in_scan
-from fusion.lidar.plane import _Bands, _fit, _Samples, plane
-from fusion.lidar.project import from_image
+from fusion.lidar.plane import _Bands, _fit, _Samples, _samples, plane
+from fusion.lidar.project import from_image, z_buffer
 from fusion.lidar.score import Score, mean_score, score
 from fusion.lidar.sparse import SparseDepth
 
@@ -322,3 +322,11 @@ def test_means_that_round_into_the_next_row_are_fitted_all_the_same() -> None:
     columns, rows = np.meshgrid(np.arange(40), np.arange(30))
     inner = np.s_[6:-6, 6:-6]
     assert np.abs(fits[0] - (0.1 + 0.002 * columns + 0.003 * rows))[inner].max() < 2e-4
+
+
+def test_samples_between_two_pixels_count() -> None:
+    """Halves round up here as in the z-buffer: rounded to even, every second one would be lost."""
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(2.5, 36, 4), np.arange(2.5, 26, 4)))
+    q = (0.1 + 0.002 * u).astype(np.float32)
+    sparse = SparseDepth((40, 30), u, v, 1 / q, "depth", np.arange(len(u), dtype=np.int64))
+    assert len(_samples(sparse, z_buffer(sparse), 1.0).u) == len(u)
