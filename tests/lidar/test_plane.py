@@ -328,5 +328,5 @@ def test_samples_between_two_pixels_count() -> None:
     """Halves round up here as in the z-buffer: rounded to even, every second one would be lost."""
     u, v = (a.ravel() for a in np.meshgrid(np.arange(2.5, 36, 4), np.arange(2.5, 26, 4)))
     q = (0.1 + 0.002 * u).astype(np.float32)
-    sparse = SparseDepth((40, 30), u, v, 1 / q, "depth", np.arange(len(u), dtype=np.int64))
+    sparse = SparseDepth((40, 30), u, v, np.reciprocal(q), "depth", np.arange(len(u), dtype=np.int64))
     assert len(_samples(sparse, z_buffer(sparse), 1.0).u) == len(u)
