@@ -11,6 +11,11 @@ distortion = [-0.1, 0.02, 0.0, 0.0, 0.0]   # pinhole: none, 4, 5 or 8; fisheye: 
 
 [transforms]
 T_rgb_lidar = [[0, -1, 0, 0.05], [0, 0, -1, 0.1], [1, 0, 0, 0], [0, 0, 0, 1]]
+
+[time_offset_s]                  # optional: added to a sensor's stamps to give the reference's clock
+fir = 0.012
+
+[evidence]                       # optional, free: what a calibration says of itself
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomlkit
@@ -42,10 +47,16 @@ _MODELS: dict[str, type[PinholeCamera] | type[FisheyeCamera]] = {
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Cameras by name (``rgb``, ``fir``), and rigid 4 x 4 transformations by ``T_dst_src``."""
+    """Cameras by name (``rgb``, ``fir``), and rigid 4 x 4 transformations by ``T_dst_src``.
+
+    `time_offset_s` by sensor is added to its stamps to give the reference's clock. `evidence` is what the
+    calibration says of itself: tables, lists, numbers and texts as TOML has them, kept as they are.
+    """
 
     cameras: Mapping[str, RigCamera] = field(default_factory=dict)
     transforms: Mapping[str, Floats] = field(default_factory=dict)
+    time_offset_s: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Own copies, their rotations orthonormal. `UsageError` for one that is not rigid, or misnamed."""
@@ -95,7 +106,8 @@ def load_rig(path: str | Path) -> Rig:
     try:
         content = _RigFile.model_validate(tomllib.loads(_text(path)))
         cameras = {name: _camera(name, entry) for name, entry in content.cameras.items()}
-        return Rig(cameras, {name: np.array(rows, np.float64) for name, rows in content.transforms.items()})
+        transforms = {name: np.array(rows, np.float64) for name, rows in content.transforms.items()}
+        return Rig(cameras, transforms, content.time_offset_s, content.evidence)
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in problem["loc"])
@@ -110,11 +122,15 @@ def load_rig(path: str | Path) -> Rig:
 
 def save_rig(path: str | Path, rig: Rig) -> None:
     """Write a rig.toml; reading it gives the same numbers. Raises `OutputError`."""
-    content = {
+    content: dict[str, object] = {
         "format": FORMAT,
         "cameras": {name: _entry(camera) for name, camera in rig.cameras.items()},
         "transforms": {name: [[float(x) for x in row] for row in T] for name, T in rig.transforms.items()},
     }
+    if rig.time_offset_s:
+        content["time_offset_s"] = {name: float(s) for name, s in rig.time_offset_s.items()}
+    if rig.evidence:
+        content["evidence"] = dict(rig.evidence)
     replace_file(Path(path), tomlkit.dumps(content).encode())
 
 
@@ -148,6 +164,8 @@ class _RigFile(BaseModel):
     format: Literal["fusion-rig/1"]
     cameras: dict[str, _CameraEntry] = {}
     transforms: dict[str, Annotated[list[_Row], Field(min_length=3, max_length=4)]] = {}
+    time_offset_s: dict[str, FiniteFloat] = {}
+    evidence: dict[str, Any] = {}
 
 
 def _camera(name: str, entry: _CameraEntry) -> RigCamera:

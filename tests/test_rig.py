@@ -209,3 +209,24 @@ def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
         file.truncate((1 << 24) + 1)  # a hole: no disk is used
     with pytest.raises(UsageError, match="too large"):
         load_rig(path)
+
+
+def test_offsets_and_evidence_come_back(tmp_path: Path) -> None:
+    evidence = {
+        "verdict": "good for 5 m",
+        "figures": {"rms_px": {"rgb": 0.25}, "views": 30},
+        "covariance": [[1e-9, -2.5e-10], [-2.5e-10, 3e-9]],
+        "inputs": [{"file": "a.png", "sha256": "00"}],
+    }
+    rig = Rig({"rgb": PinholeCamera((640, 480), 500, 500, 319.5, 239.5)}, {}, {"fir": -0.0125}, evidence)
+    save_rig(tmp_path / "rig.toml", rig)
+    again = load_rig(tmp_path / "rig.toml")
+    assert again.time_offset_s == {"fir": -0.0125}
+    assert again.evidence == evidence
+
+
+def test_an_offset_must_be_a_number(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text('format = "fusion-rig/1"\n[time_offset_s]\nfir = nan\n')
+    with pytest.raises(UsageError, match="time_offset_s.fir"):
+        load_rig(path)
