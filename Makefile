@@ -10,7 +10,7 @@ help:
 	@echo "make test       the tests"
 	@echo "make check      all that CI runs: lint, types, tests, notebooks, wheel"
 	@echo "make bench      the benchmarks; writes docs/benchmarks.md"
-	@echo "make accuracy   errors of every depth method; writes its tables into docs/depth.md"
+	@echo "make accuracy   errors of depth and calibration; writes its tables into docs/"
 	@echo "make notebooks  run the notebooks"
 	@echo "make clean      remove environments and products"
 
@@ -57,7 +57,7 @@ bench: $(VENV)/ready
 	$(BIN)/python benchmarks/bench.py --write docs/benchmarks.md
 
 accuracy: $(VENV)/ready
-	$(BIN)/python benchmarks/accuracy.py --write docs/depth.md
+	$(BIN)/python benchmarks/accuracy.py --write docs
 
 clean:
 	rm -rf $(VENV) demo dist .pytest_cache .ruff_cache .hypothesis

@@ -21,6 +21,7 @@ import inprocess
 import lidar
 import memory
 import mine
+import warp
 from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
 from processes import Processes
 from table import Section, summary
@@ -43,10 +44,11 @@ class Plan:
     help_rounds: int = 11
     lidar_rounds: int = 9
     mine_rounds: int = 3
+    warp_rounds: int = 9
     distinct: int = 12
 
 
-QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 4)
+QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 4)
 
 METHOD = """\
 Jobs that are compared run in turn (A B C A B C …) after a warm-up round; every figure is the median of its
@@ -116,6 +118,7 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
     "memory": _simple(lambda p, space: memory.measure(space, p.distinct, p.few, p.many, p.memory_rounds)),
     "encoders": _simple(lambda plan, _: encoders.measure(plan.encode_rounds)),
     "lidar": _simple(lambda plan, _: lidar.measure(plan.lidar_rounds)),
+    "warp": _simple(lambda plan, _: warp.measure(plan.warp_rounds)),
     "mine": _simple(lambda plan, space: mine.measure(space, plan.mine_rounds)),
     "help": _simple(lambda plan, space: memory.measure_start(space, plan.help_rounds)),
 }
@@ -139,7 +142,8 @@ def method(plan: Plan) -> str:
     rounds = (
         f"{plan.compute_rounds} rounds in memory, {plan.run_rounds} in one process,"
         f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders,"
-        f" {plan.memory_rounds} of memory, {plan.lidar_rounds} of LiDAR, {plan.mine_rounds} of the mine,"
+        f" {plan.memory_rounds} of memory, {plan.lidar_rounds} of LiDAR,"
+        f" {plan.warp_rounds} of warps from a rig, {plan.mine_rounds} of the mine,"
         f" {plan.help_rounds} of start-up"
     )
     return METHOD.format(

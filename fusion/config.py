@@ -19,7 +19,13 @@ from fusion.settings import Group, first_problem, merged, read_settings
 from fusion.thermal import WindowRule
 
 FORMAT = "fusion-blend/1"
-PATHS = (("warp", "homography"), ("warp", "points"), ("pairing", "map"))
+PATHS = (
+    ("warp", "homography"),
+    ("warp", "points"),
+    ("warp", "rig"),
+    ("warp", "depth"),
+    ("pairing", "map"),
+)
 
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "auto": {
@@ -72,6 +78,11 @@ class WarpConfig(Group):
 
     homography: str | None = None
     points: str | None = None
+    rig: str | None = None
+    mode: Literal["infinity", "distance", "depth"] | None = None  # of a rig; None: by what is given
+    distance_m: float | None = Field(default=None, gt=0)
+    depth: str | None = None
+    undistort: bool = False
     outside: Literal["crop", "keep", "fill"]
     fill_bgr: tuple[Level, Level, Level] = (0, 0, 0)
 
@@ -125,7 +136,33 @@ def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
         config = BlendConfig.model_validate(merged(PRESETS[preset], settings))
     except ValidationError as error:
         raise UsageError(first_problem(error), where=where) from None
-    if config.warp.homography and config.warp.points:
-        raise UsageError("homography and points exclude each other", where=where, hint="give one of them")
+    warp = _checked_warp(config.warp, where)
     config.thermal.rule()
-    return config
+    return config.model_copy(update={"warp": warp})
+
+
+def _checked_warp(warp: WarpConfig, where: str) -> WarpConfig:
+    """One way of registering, whole, its mode said."""
+    given = [name for name in ("homography", "points", "rig") if getattr(warp, name)]
+    if len(given) > 1:
+        raise UsageError(
+            f"{given[0]} and {given[1]} exclude each other", where=where, hint="give one of them"
+        )
+    if warp.rig is None:
+        for name in ("mode", "distance_m", "depth", "undistort"):
+            if getattr(warp, name):
+                hint = "give --rig FILE, the calibration of both cameras"
+                raise UsageError(f"warp.{name} means nothing without a rig", where=where, hint=hint)
+        return warp
+    fallback = "depth" if warp.depth else "distance" if warp.distance_m else "infinity"
+    mode = warp.mode or fallback
+    if mode == "distance" and warp.distance_m is None:
+        raise UsageError("a warp at a distance has no distance", where=where, hint="give --distance METRES")
+    if mode == "depth" and warp.depth is None:
+        hint = "give --depth FOLDER, as `fusion depth --rig` writes it"
+        raise UsageError("a warp by depth has no depth", where=where, hint=hint)
+    for name, modes in (("distance_m", ("distance", "depth")), ("depth", ("depth",))):
+        if getattr(warp, name) and mode not in modes:
+            hint = "leave one of them out"
+            raise UsageError(f"warp.{name} means nothing with mode {mode}", where=where, hint=hint)
+    return warp.model_copy(update={"mode": mode})

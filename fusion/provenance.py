@@ -10,6 +10,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fusion.rig_warp import DepthWarp
+from fusion.warp import Warp
+
 if TYPE_CHECKING:
     from fusion.lidar.lane import DepthLane
     from fusion.pipeline import Fuser
@@ -22,13 +25,15 @@ def describe_run(fuser: Fuser) -> dict[str, Any]:
     """Nested, TOML-able: versions, inputs, effective configuration, registration, windows.
 
     The inputs are known by their paired names, not by their paths, so that a moved data set is still
-    the same run; registration files are known by the SHA-256 of their bytes.
+    the same run; registration files are known by the SHA-256 of their bytes, a rig by its numbers.
     """
     config = fuser.config.model_dump(exclude_none=True)
     del config["strict"]  # changes where a run stops, not what it writes
     for key in ("homography", "points"):
         if key in config["warp"]:
             config["warp"][key] = _file_mark(config["warp"][key])
+    for key in ("rig", "depth"):  # the rig is known by its numbers, depth maps by their names
+        config["warp"].pop(key, None)
     if "map" in config["pairing"]:
         config["pairing"]["map"] = _file_mark(config["pairing"]["map"])
     return {
@@ -37,6 +42,7 @@ def describe_run(fuser: Fuser) -> dict[str, Any]:
             "pairs": len(fuser),
             "unmatched": len(fuser.pairs.pairing.unmatched),
             "names_sha256": _digest("\0".join(fuser.pairs.stems(index)) for index in range(len(fuser))),
+            **_depth_inputs(fuser),
         },
         "config": _plain(config),
         "registration": _registration(fuser),
@@ -86,18 +92,30 @@ def _file_mark(path: str) -> str:
     return f"{Path(path).name} sha256:{hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
 
 
+def _depth_inputs(fuser: Fuser) -> dict[str, Any]:
+    from fusion.pipeline import PairsWithDepth
+
+    if not isinstance(fuser.pairs, PairsWithDepth):
+        return {}
+    names = [fuser.pairs.depth.name(index) for index in range(len(fuser))]
+    return {"depth_maps": sum(map(bool, names)), "depth_names_sha256": _digest(names)}
+
+
 def _registration(fuser: Fuser) -> dict[str, Any]:
     registration, warp = fuser.registration, fuser.warp
     record: dict[str, Any] = {
-        "kind": registration.kind,
-        "H_rgb_fir": registration.H_rgb_fir.tolist(),
+        **(
+            _rig(fuser)
+            if registration is None
+            else {"kind": registration.kind, "H_rgb_fir": registration.H_rgb_fir.tolist()}
+        ),
         "fir_size_wh": list(fuser.sizes[0]),
         "rgb_size_wh": list(fuser.sizes[1]),
         "coverage": round(warp.coverage, 6),
         "border_ltrb": list(warp.border_ltrb),
         "crop_xywh": list(warp.crop_xywh),
     }
-    fit = registration.fit
+    fit = None if registration is None else registration.fit
     if fit is not None:
         record["fit"] = {
             "points": fit.count,
@@ -109,6 +127,26 @@ def _registration(fuser: Fuser) -> dict[str, Any]:
         if fit.leave_one_out_px is not None:
             record["fit"]["leave_one_out_px"] = round(fit.leave_one_out_px, 6)
     return record
+
+
+def _rig(fuser: Fuser) -> dict[str, Any]:
+    """The numbers of the rig that a warp uses, whatever file they came from."""
+    if fuser.rig is None or isinstance(fuser.warp, Warp):
+        raise ValueError("expected a warp by a rig")
+    cameras = {
+        name: {"kind": type(camera).__name__, **asdict(camera)}
+        for name, camera in (("rgb", fuser.rig.camera("rgb")), ("fir", fuser.rig.camera("fir")))
+    }
+    output = fuser.warp.views.output
+    record = {
+        "kind": "rig",
+        "T_rgb_fir": fuser.rig.pose("rgb", "fir").tolist(),
+        "cameras": cameras,
+        "output": {"kind": type(output).__name__, **asdict(output)},
+    }
+    if isinstance(fuser.warp, DepthWarp):
+        record["value"] = fuser.warp.value
+    return _plain(record)
 
 
 def _plain(value: Any) -> Any:

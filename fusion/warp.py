@@ -180,6 +180,10 @@ class Warp:
 
         return resample(np.ascontiguousarray(index), *self._sampling, out)
 
+    def rgb(self, bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The RGB image on the grid of the result: itself. (Warps from a rig may undistort it.)"""
+        return bgr
+
 
 def _inverse(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size) -> NDArray[np.float64]:
     """H_fir_rgb, scaled so that its denominator is positive where the thermal image lands."""

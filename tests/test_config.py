@@ -43,6 +43,21 @@ def test_a_window_by_hand_is_a_fraction_whatever_the_preset() -> None:
         BlendConfig.of(thermal={"window": (2, 98)})  # percentiles without saying so
 
 
+@pytest.mark.parametrize(
+    ("given", "mode"),
+    [
+        ({}, "infinity"),
+        ({"distance_m": 5}, "distance"),
+        ({"depth": "maps"}, "depth"),
+        ({"depth": "maps", "distance_m": 5}, "depth"),
+    ],
+)
+def test_the_mode_of_a_rig_follows_from_what_is_given(given: dict[str, object], mode: str) -> None:
+    assert BlendConfig.of(warp={"rig": "rig.toml", **given}).warp.mode == mode
+    assert BlendConfig.of(warp={"rig": "rig.toml", "mode": mode, **given}).warp.mode == mode
+    assert BlendConfig.of().warp.mode is None
+
+
 def test_paths_in_the_file_count_from_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "sub" / "run.toml"
     path.parent.mkdir()
@@ -63,6 +78,14 @@ def test_paths_in_the_file_count_from_its_folder(tmp_path: Path) -> None:
         ({"thermal": {"window": (0.6, 0.3)}}, "--window"),
         ({"thermal": {"window": (0.1, 0.2, 0.3)}}, "thermal.window"),
         ({"warp": {"homography": "a", "points": "b"}}, "exclude"),
+        ({"warp": {"homography": "a", "rig": "b"}}, "exclude"),
+        ({"warp": {"points": "a", "rig": "b"}}, "exclude"),
+        ({"warp": {"mode": "infinity"}}, "warp.mode means nothing without a rig"),
+        ({"warp": {"undistort": True}}, "warp.undistort means nothing without a rig"),
+        ({"warp": {"rig": "a", "mode": "distance"}}, "has no distance"),
+        ({"warp": {"rig": "a", "mode": "depth", "distance_m": 2}}, "has no depth"),
+        ({"warp": {"rig": "a", "mode": "infinity", "depth": "b"}}, "warp.depth means nothing"),
+        ({"warp": {"rig": "a", "distance_m": -1}}, "warp.distance_m"),
     ],
 )
 def test_bad_settings_name_their_key(settings: dict[str, object], named: str) -> None:

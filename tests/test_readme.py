@@ -269,8 +269,9 @@ def test_documented_alternatives_are_right_in_a_file_of_their_own(
     tmp_path: Path, table: str, line: str
 ) -> None:
     path = tmp_path / "run.toml"
-    path.write_text(f'format = "fusion-blend/1"\n[{table}]\n{line}\n', encoding="utf-8")
     key = line.split(" = ")[0]
+    rig = 'rig = "rig.toml"\n' if key in ("mode", "distance_m", "depth") else ""  # they go with it
+    path.write_text(f'format = "fusion-blend/1"\n[{table}]\n{rig}{line}\n', encoding="utf-8")
     config = load_config(path, {})
     config.pairing.rule()
     assert key in getattr(config, table).model_fields_set

@@ -76,6 +76,23 @@ def blend(
     points: Annotated[
         str | None, Parameter(group=WARP, help="CSV of matching points: fir_x,fir_y,rgb_x,rgb_y.")
     ] = None,
+    rig: Annotated[
+        str | None, Parameter(group=WARP, help="Calibration of both cameras: rig.toml, or another tool's.")
+    ] = None,
+    warp: Annotated[
+        Literal["infinity", "distance", "depth"] | None,
+        Parameter(group=WARP, help="With --rig: where things are. Default: by what else is given."),
+    ] = None,
+    distance: Annotated[
+        float | None,
+        Parameter(group=WARP, help="Metres along RGB's axis; with --depth: where a map has none."),
+    ] = None,
+    depth: Annotated[
+        str | None, Parameter(group=WARP, help="Depth maps of the RGB camera, by `fusion depth --rig`.")
+    ] = None,
+    undistort: Annotated[
+        bool | None, Parameter(group=WARP, help="With --rig: the frames are those of an ideal pinhole.")
+    ] = None,
     outside: Annotated[
         Literal["crop", "keep", "fill"] | None, Parameter(group=WARP, help="Where thermal does not reach.")
     ] = None,

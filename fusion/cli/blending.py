@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
+import tomllib
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fusion.batch import opencv_on_one_thread, run
+from fusion.cli.partners import Partners
 from fusion.cli.running import progress_bar, quiet_libraries, refuse_overlap, threads_of, warn
 from fusion.codecs import encode_png
 from fusion.config import BlendConfig, load_config
@@ -17,12 +23,16 @@ from fusion.errors import FrameError, InputError, UsageError
 from fusion.files import replace_file
 from fusion.manifest import Manifest, load_manifest
 from fusion.pairing import report_lines
-from fusion.pipeline import Fuser
+from fusion.pipeline import Fuser, PairsWithDepth
 from fusion.provenance import describe_run
 from fusion.report.sheet import contact_sheet
 from fusion.report.text import closing_lines, plan_lines, warnings_of
+from fusion.rig import Rig
+from fusion.rig_warp import Value
 from fusion.settings import nested
+from fusion.sinks.depth import PER_METRE
 from fusion.sinks.folder import FolderSink
+from fusion.sources import Source, open_source
 from fusion.sync import Pairs, open_pairs
 
 PREVIEW = "preview.png"
@@ -46,6 +56,11 @@ PLACES = {
     "fir_colour": ("thermal", "fir_colour"),
     "homography": ("warp", "homography"),
     "points": ("warp", "points"),
+    "rig": ("warp", "rig"),
+    "warp": ("warp", "mode"),
+    "distance": ("warp", "distance_m"),
+    "depth": ("warp", "depth"),
+    "undistort": ("warp", "undistort"),
     "outside": ("warp", "outside"),
     "fill_bgr": ("warp", "fill_bgr"),
     "method": ("blend", "method"),
@@ -76,14 +91,19 @@ def run_blend(
         raise UsageError("no output folder", where="--out", hint="give -o OUT, or only --dry-run")
     threads = threads_of(workers)
     if out is not None:
-        refuse_overlap(inputs, out, ("fused", "mask"))
-    manifest = manifest_of(dataset, settings, inputs)
-    with quiet_libraries(), closing(open_inputs(settings, inputs, manifest)) as pairs:
+        refuse_overlap(
+            [*inputs, *([settings.warp.depth] if settings.warp.depth else [])], out, ("fused", "mask")
+        )
+    manifest, rig = manifest_of(dataset, settings, inputs), rig_of(settings)
+    with quiet_libraries(), ExitStack() as open_things:
+        pairs = open_inputs(settings, inputs, manifest)
+        open_things.callback(pairs.close)
         report_pairing(pairs, settings.strict, show=dry_run)
+        depth = depth_of(settings, pairs, rig, open_things)
         if out is None or (dry_run and not preview):
             return
-        fuser = Fuser(pairs, settings)
-        warn([*unlike_the_manifest(manifest, pairs), *fuser.registration.notes])
+        fuser = Fuser(pairs if depth is None else PairsWithDepth(pairs, depth), settings, rig)
+        warn([*unlike_the_manifest(manifest, pairs), *fuser.notes, *(depth.notes if depth else [])])
         if dry_run:
             replace_file(out / PREVIEW, _preview_png(fuser))
             print(f"preview: {out / PREVIEW}")
@@ -110,11 +130,12 @@ def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str
         hint = "fusion blend --dataset NAME ROOT -o OUT"
         raise UsageError("a data set has one root", where="--dataset", hint=hint)
     manifest = load_manifest(dataset)
-    if not manifest.registered and not (settings.warp.homography or settings.warp.points):
+    warp = settings.warp
+    if not manifest.registered and not (warp.homography or warp.points or warp.rig):
         raise InputError(
             "its thermal images are not registered to its RGB images: as they are, they do not fit",
             where=f"data set {manifest.name}",
-            hint="give --homography FILE or --points CSV",
+            hint="give --rig FILE, --homography FILE or --points CSV",
         )
     return manifest
 
@@ -128,6 +149,92 @@ def open_inputs(settings: BlendConfig, inputs: Sequence[str], manifest: Manifest
     if not settings.pairing.model_fields_set:
         rule = manifest.pairing_rule(inputs[0])
     return open_pairs(rgb, fir, rule, fir_colour=fir_colour)
+
+
+def rig_of(settings: BlendConfig) -> Rig | None:
+    """The rig that the settings name, which must have both cameras and say how they stand."""
+    path = settings.warp.rig
+    if path is None:
+        return None
+    from calib.formats import read_rig
+
+    rig = read_rig(path)
+    try:
+        for name in ("rgb", "fir"):
+            rig.camera(name)
+        rig.pose("rgb", "fir")
+    except UsageError as error:
+        raise UsageError(error.what, where=path, hint=error.hint) from None
+    return rig
+
+
+def depth_of(
+    settings: BlendConfig, pairs: Pairs, rig: Rig | None, open_things: ExitStack
+) -> DepthFolder | None:
+    """The depth maps that the settings name, paired with RGB."""
+    if settings.warp.depth is None or rig is None:
+        return None
+    folder, value = depth_maps_in(settings.warp.depth, rig)
+    source = open_source(folder, "fir", fir_colour="luma")  # 16-bit grey, as thermal is
+    open_things.callback(source.close)
+    return DepthFolder(source, [pairs.stems(index)[0] for index in range(len(pairs))], value)
+
+
+def depth_maps_in(spec: str, rig: Rig) -> tuple[str, Value | None]:
+    """Where the maps lie, and what they hold, if that is the output of `fusion depth` and says so.
+
+    Raises `InputError` where it says that they are of another camera than the rig's.
+    """
+    folder = Path(spec)
+    if (folder / "run.toml").is_file() and (folder / "depth").is_dir():
+        folder = folder / "depth"
+    try:
+        run = tomllib.loads((folder.parent / "run.toml").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return str(folder), None
+    if folder.name != "depth" or run.get("value") not in ("depth", "range"):
+        return str(folder), None
+    made_for, camera = run.get("camera"), rig.camera("rgb")
+    ours: dict[str, Any] = {"kind": type(camera).__name__, **asdict(camera)}
+    if not isinstance(made_for, dict) or not all(_alike(made_for.get(key), ours[key]) for key in ours):
+        hint = "make them again: fusion depth CLOUDS -o OUT --rig with this rig"
+        raise InputError(
+            "the maps are of another camera than the rig's rgb", where=f"--depth {spec}", hint=hint
+        )
+    return str(folder), run["value"]
+
+
+def _alike(theirs: object, ours: object) -> bool:
+    if isinstance(ours, str):
+        return theirs == ours
+    try:
+        one, other = np.asarray(theirs, np.float64), np.asarray(ours, np.float64)
+    except (TypeError, ValueError):
+        return False
+    return one.shape == other.shape and bool(np.allclose(one, other, rtol=1e-9, atol=1e-12))
+
+
+class DepthFolder:
+    """The maps of a source for pairs whose RGB images are called `stems`: `fusion.pipeline.DepthMaps`."""
+
+    def __init__(self, source: Source, stems: Sequence[str], value: Value | None) -> None:
+        self.value: Value | None = value
+        self._partners = Partners("--depth", source, stems)
+        self.notes = self._partners.notes
+
+    def name(self, index: int) -> str:
+        return Path(self._partners.file(index)).stem
+
+    def read_m(self, index: int) -> NDArray[np.float32]:
+        image, where = self._partners.read(index), self._partners.file(index)
+        if "fir-colour-to-luma" in image.flags or image.pixels.dtype != np.uint16:
+            hint = "16-bit grey, metres x 256, 0 = none, as `fusion depth` writes them"
+            raise FrameError("the picture is no depth map", where=where, hint=hint)
+        return image.pixels.astype(np.float32) / np.float32(PER_METRE)
+
+    def changed_ns(self, index: int) -> int:
+        path = self._partners.file(index)
+        return Path(path).stat().st_mtime_ns if path and Path(path).exists() else 0
 
 
 def unlike_the_manifest(manifest: Manifest | None, pairs: Pairs) -> list[str]:

@@ -46,6 +46,66 @@ MINE_EXAMPLES = """Examples:
   fusion simulate mine dusty/ --preset dusty --seed 3 --duration 20
   fusion simulate mine fast/ --speed 3 --max-rate 200 --rings 16"""
 
+CALIBRATE_EXAMPLES = """Examples:
+  fusion calibrate board board.pdf --kind chessboard --cols 9 --rows 6 --spacing-mm 80
+  fusion calibrate stereo rgb/ fir/ --board board.toml -o cameras.toml
+  fusion calibrate lidar rgb/ lidar/ --board board.toml --rig cameras.toml -o rig.toml
+  fusion blend rgb/ fir/ -o out/ --rig rig.toml --distance 5
+  fusion calibrate align rgb/ fir/ -o H.toml
+  fusion calibrate check rig.toml
+  fusion calibrate convert rig.toml camchain.yaml"""
+_CALIBRATE = {
+    "board": (
+        "Print a board to scale, and describe it.",
+        """Examples:
+  fusion calibrate board board.pdf
+  fusion calibrate board board.svg --kind charuco --cols 8 --rows 6 --spacing-mm 40
+  fusion calibrate board tags.pdf --board kalibr_target.yaml""",
+    ),
+    "intrinsics": (
+        "Calibrate one camera from images of a board.",
+        """Examples:
+  fusion calibrate intrinsics rgb/ --board board.toml -o rgb.toml
+  fusion calibrate intrinsics fir/ --board board.toml -o fir.toml --camera fir --debug
+  fusion calibrate intrinsics gopro.mp4 --board board.toml -o wide.toml --model fisheye""",
+    ),
+    "stereo": (
+        "Calibrate RGB and thermal: both cameras, and how they stand to each other.",
+        """Examples:
+  fusion calibrate stereo rgb/ fir/ --board board.toml -o rig.toml
+  fusion calibrate stereo rgb/ fir/ --board board.toml -o rig.toml --pair order
+  fusion calibrate stereo rgb/ fir/ --board board.toml -o rig.toml --timing offset""",
+    ),
+    "lidar": (
+        "Calibrate a LiDAR to a camera: by a board, by given points, or by the scene.",
+        """Examples:
+  fusion calibrate lidar rgb/ lidar/ --board board.toml --rig cameras.toml -o rig.toml
+  fusion calibrate lidar rgb/ lidar/ --fir fir/ --board board.toml --rig cameras.toml -o rig.toml --refine
+  fusion calibrate lidar rgb.png scan.pcd --points points.csv --rig cameras.toml -o rig.toml
+  fusion calibrate lidar rgb/ lidar/ --rig rig.toml -o better.toml""",
+    ),
+    "align": (
+        "Lay thermal onto RGB from the scene alone.",
+        """Examples:
+  fusion calibrate align rgb/ fir/ -o H.toml
+  fusion calibrate align rgb.png fir.png -o H.toml --model affine
+  fusion blend rgb/ fir/ -o out/ --homography H.toml""",
+    ),
+    "check": (
+        "Check a calibration without any board.",
+        """Examples:
+  fusion calibrate check rig.toml
+  fusion calibrate check camchain.yaml --rgb rgb/ --fir fir/""",
+    ),
+    "convert": (
+        "Write a calibration in another tool's form.",
+        """Examples:
+  fusion calibrate convert rig.toml camchain.yaml
+  fusion calibrate convert calib.json rig.toml
+  fusion calibrate convert rig.toml rgb.yaml --form ros""",
+    ),
+}
+
 app = App(
     name="fusion",
     help="Fused RGB-thermal frames for trackers. Start with: fusion blend RGB FIR -o OUT --preview",
@@ -82,6 +142,16 @@ simulate.command(
     help="Draw unregistered RGB-thermal pairs of a mine, with their truth.",
 )
 app.command(simulate)
+calibrate = App(
+    name="calibrate",
+    help="Calibrate a rig of RGB, thermal and LiDAR, from a board or from the scene; check and convert it.",
+    help_epilogue=CALIBRATE_EXAMPLES,
+)
+for _name, (_help, _examples) in _CALIBRATE.items():
+    calibrate.command(
+        f"fusion.cli.calibrate:calibrate_{_name}", name=_name, help=_help, help_epilogue=_examples
+    )
+app.command(calibrate)
 
 USAGE, INTERRUPTED, INTERNAL = 2, 130, 70
 

@@ -50,6 +50,16 @@ def refuse_overlap(inputs: Sequence[str], out: Path, folders: Sequence[str]) -> 
                 raise OutputError(f"would overwrite the input {spec}", where=out, hint="choose another -o")
 
 
+def refuse_existing(out: Path, overwrite: bool) -> None:
+    """Raises `OutputError` where something would be written over."""
+    if out.is_dir():
+        raise OutputError("is a folder", where=out, hint="-o is the file to write")
+    if out.exists() and not overwrite:
+        raise OutputError(
+            "is there already", where=out, hint="--overwrite replaces it, or choose another name"
+        )
+
+
 def fixed_folder(spec: str) -> Path | None:
     """The folder that a folder or glob specification reads from; None for single files."""
     path = Path(spec)

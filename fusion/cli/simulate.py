@@ -68,9 +68,10 @@ def simulate_session(
     *,
     config: Annotated[Path | None, Parameter(help="TOML as for simulate mine.")] = None,
     board: Annotated[
-        Literal["chessboard", "circles"], Parameter(help="What is printed on it.")
-    ] = "chessboard",
-    poses: Annotated[int, Parameter(help="How often the board is shown.")] = 30,
+        Literal["chessboard", "circles"] | None,
+        Parameter(help="What is printed on it. Default: a chessboard, or what --config says."),
+    ] = None,
+    poses: Annotated[int | None, Parameter(help="How often the board is shown. Default: 30.")] = None,
     seed: Annotated[int | None, Parameter(help="Other poses. The same seed, the same bytes.")] = None,
     quiet: Annotated[bool, Parameter(help="No progress, no table.")] = False,
 ) -> None:

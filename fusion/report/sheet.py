@@ -38,7 +38,7 @@ def contact_sheet(fuser: Fuser, frames: int = 5) -> NDArray[np.uint8]:
 def panels(stages: Stages) -> dict[str, NDArray[np.uint8]]:
     """The pictures of one frame by title (BGR uint8, each on its own grid), in the order of the steps."""
     bgr, counts = stages.frames.bgr, stages.frames.counts
-    inside = stages.warp.mask[..., None] > 0
+    inside = stages.mask[..., None] > 0
     grey = cv2.cvtColor(_full_range(counts), cv2.COLOR_GRAY2BGR)
     onto_rgb = cv2.addWeighted(bgr, 0.5, cv2.cvtColor(stages.warped, cv2.COLOR_GRAY2BGR), 0.5, 0)
     pictures = (

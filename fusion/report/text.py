@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from fusion.batch import RunReport
 from fusion.pipeline import Fuser
 from fusion.report.table import LOUD_SKIPS, table
+from fusion.rig_warp import PARALLAX_M, DepthWarp, parallax_px
 from fusion.thermal import clip_advice
+from fusion.warp import Warp
 
 
 def plan_lines(fuser: Fuser) -> list[str]:
@@ -20,6 +23,7 @@ def plan_lines(fuser: Fuser) -> list[str]:
         ("pairs", f"{len(fuser)} by {pairing.rule_by}, {len(pairing.unmatched)} unmatched"),
         ("sizes", f"thermal {fir}, RGB {rgb}"),
         ("registration", _registration(fuser)),
+        *_rig_rows(fuser),
         ("coverage", f"{warp.coverage:.1%} of RGB"),
     ]
     if fuser.pairs.ignored:
@@ -43,6 +47,7 @@ def closing_lines(fuser: Fuser, report: RunReport, out: Path) -> list[str]:
         ("window", f"{_span(report.window_lo)} to {_span(report.window_hi)} counts"),
         ("clipped", f"{report.clipped_below:.1%} below, {report.clipped_above:.1%} above"),
     ]
+    rows += _depth_rows(fuser)
     dt = fuser.pairs.pairing.summary()
     if dt.dt_median_ms is not None:
         rows.append(("time apart", f"median {dt.dt_median_ms:.3f} ms, largest {dt.dt_max_ms:.3f} ms"))
@@ -70,13 +75,59 @@ def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
 
 
 def _registration(fuser: Fuser) -> str:
-    registration, fit = fuser.registration, fuser.registration.fit
+    registration = fuser.registration
+    if registration is None:
+        return _rig(fuser)
+    fit = registration.fit
     if fit is None:
         return "none: scaled to fit" if registration.kind == "scale" else registration.kind
     text = f"{fit.inliers} of {fit.count} points, rms {fit.rms_px:.2f} px, largest {fit.max_px:.2f} px"
     return text + (
         f", left out median {fit.leave_one_out_px:.2f} px" if fit.leave_one_out_px is not None else ""
     )
+
+
+def _rig(fuser: Fuser) -> str:
+    warp, given = fuser.warp, fuser.config.warp
+    undistorted = ", RGB undistorted" if given.undistort else ""
+    if not isinstance(warp, DepthWarp):
+        return f"rig, {_metres(given.distance_m)}{undistorted}"
+    otherwise = (
+        f"{_metres(warp.distance_m)} where there is none"
+        if warp.distance_m
+        else "nothing where there is none"
+    )
+    return f"rig, by {warp.value}, {otherwise}{undistorted}"
+
+
+def _rig_rows(fuser: Fuser) -> list[tuple[str, str]]:
+    """What a wrong distance would cost: how far off thermal is drawn for things nearer and farther."""
+    warp = fuser.warp
+    if isinstance(warp, Warp) or fuser.rig is None or (isinstance(warp, DepthWarp) and not warp.distance_m):
+        return []
+    at_m = fuser.config.warp.distance_m or math.inf
+    undistort = fuser.config.warp.undistort
+    off = parallax_px(fuser.rig, at_m, PARALLAX_M, undistort)
+    cells = [
+        f"{'not seen' if math.isnan(px) else f'{px:.1f} px'} for things at {_metres(metres)}"
+        for metres, px in zip(PARALLAX_M, off, strict=True)
+    ]
+    return [("parallax" if row == 0 else "", cell) for row, cell in enumerate(cells)]
+
+
+def _depth_rows(fuser: Fuser) -> list[tuple[str, str]]:
+    tally = fuser.depth_tally
+    if not tally.frames:
+        return []
+    words = f"{tally.seen / tally.pixels:.1%} seen, {tally.hidden / tally.pixels:.1%} hidden from thermal"
+    words += f", {tally.unknown / tally.pixels:.1%} without depth"
+    if isinstance(fuser.warp, DepthWarp) and fuser.warp.distance_m:
+        words += f", {tally.assumed / tally.pixels:.1%} taken to be at {_metres(fuser.warp.distance_m)}"
+    return [("by depth", f"{words} (of the pixels of {tally.frames} frames made now)")]
+
+
+def _metres(distance_m: float | None) -> str:
+    return "infinity" if distance_m is None or math.isinf(distance_m) else f"{distance_m:g} m"
 
 
 def _span(span: tuple[float, float] | None) -> str:

@@ -306,7 +306,7 @@ def test_numbers_that_are_no_calibration(tmp_path: Path) -> None:
         (words(P2), words(skewed), "P2 is no camera matrix without skew"),
         (words(P2), words(2 * P2), "P2 is no camera matrix"),
         (words(P2), words(P2 * [[-1], [1], [1]]), "P2: focal lengths must be positive"),
-        (words(P2), words(0 * P2), "P2 is no camera matrix"),
+        (words(P2), words(0 * P2), "P2: the camera is uncalibrated"),
         (words(R_RECT), words(0 * R_RECT), "R0_rect: the transformation is not rigid"),
         (good, words(scaled), "Tr_velo_to_cam: the transformation is not rigid"),
         (good, words(mirrored), "Tr_velo_to_cam: the transformation mirrors"),

@@ -1,7 +1,8 @@
 """A calibration session as a recording: a heated board held still before all three sensors, pose after pose.
 
 rgb/, fir/ and lidar/ hold one file a pose, truth/ what `recording` writes of a standing drone, and
-`poses_board.tum` (T_world_board), `corners_rgb.csv`, `corners_fir.csv`: where the board's corners truly are.
+`board.toml` (what was held), `poses_board.tum` (T_world_board), `corners_rgb.csv`, `corners_fir.csv`: where
+the board's corners truly are.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 from numpy.typing import ArrayLike, NDArray
 
 from fusion.clouds import write_pcd
@@ -18,7 +20,7 @@ from fusion.files import replace_file
 from fusion.geometry import Floats, PinholeCamera, invert, transform
 from fusion.rig import Rig, save_rig
 from fusion.simulate.mine import layout
-from fusion.simulate.mine.board import Session, build_session
+from fusion.simulate.mine.board import Board, Session, build_session
 from fusion.simulate.mine.config import MineConfig
 from fusion.simulate.mine.lidar import LidarSensor
 from fusion.simulate.mine.motion import Clock, mounted
@@ -99,6 +101,7 @@ class _Sitting:
     def _write_small(self) -> None:
         truth, body = self._out / "truth", self._session.T_world_body
         replace_file(truth / "mine.toml", self._config.toml().encode())
+        replace_file(truth / "board.toml", _board_toml(self._session.board).encode())
         T_rgb_body, cameras = (
             invert(self._mounts["rgb"]),
             {"rgb": self._rgb.viewer.camera, "fir": self._fir.viewer.camera},
@@ -129,3 +132,17 @@ class _Sitting:
                 for j, ((u, v), s) in enumerate(zip(uv, seen, strict=True))
             ]
         return rows
+
+
+def _board_toml(board: Board) -> str:
+    """The board as calibration takes it; what its spacing is, for circles, is the distance of rows."""
+    config = board.config
+    table: dict[str, object] = {
+        "format": "fusion-board/1",
+        "kind": "asymmetric-circles" if config.kind == "circles" else config.kind,
+        "cols": config.cols,
+        "rows": config.rows,
+        "spacing_m": config.square_m,
+        "plate_m": [round(float(edge), 9) for edge in board.box_m],
+    }
+    return tomlkit.dumps(table)

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from small_worlds import Room, small
 
+from calib.boards import load_board
 from fusion.clouds import read_cloud
 from fusion.codecs import decode_image
 from fusion.errors import OutputError
@@ -92,3 +93,13 @@ def test_scan_hits_the_board(folder: Path) -> None:
 def test_used_folder_is_refused(folder: Path) -> None:
     with pytest.raises(OutputError, match="not empty"):
         make_session(folder, CONFIG)
+
+
+@pytest.mark.parametrize("config", [BOARD, BoardConfig.circles()], ids=lambda config: config.kind)
+def test_board_is_written_as_calibration_takes_it(config: BoardConfig, tmp_path: Path) -> None:
+    held = Board.of(config)
+    session = Session(Room(), held, np.eye(4), held_at(0.0, 1.4)[None])  # type: ignore[arg-type]
+    make_session(tmp_path / "session", CONFIG, session=session)
+    board = load_board(tmp_path / "session" / "truth" / "board.toml")
+    np.testing.assert_allclose(board.points_m, held.corners_m, atol=1e-12)
+    np.testing.assert_allclose(board.plate_m or (), held.box_m, atol=1e-9)

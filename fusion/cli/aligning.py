@@ -1,0 +1,108 @@
+"""What `fusion calibrate align` and `fusion blend --align` do: thermal onto RGB from the scene alone."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.align import Alignment, align
+from calib.align.picture import overlay_picture
+from fusion.batch import opencv_on_one_thread
+from fusion.cli.running import quiet_libraries, refuse_existing, warn
+from fusion.codecs import encode_jpeg
+from fusion.errors import FrameError, InputError, UsageError
+from fusion.files import replace_file
+from fusion.frames import FrameSet
+from fusion.pairing import PairingRule
+from fusion.registration import write_homography
+from fusion.sync import Pairs, open_pairs
+
+Model = Literal["auto", "similarity", "affine", "homography"]
+FRAMES = 8  # pairs that are pooled
+
+
+def run_align(
+    rgb: str,
+    fir: str,
+    out: Path,
+    model: Model,
+    matcher: str,
+    frames: int,
+    pair: Any,
+    tolerance_ms: float | None,
+    *,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    if frames < 1:
+        raise UsageError(f"{frames} frames", where="--frames", hint="at least 1")
+    refuse_existing(out, overwrite)
+    tolerance_ns = None if tolerance_ms is None else round(tolerance_ms * 1e6)
+    rule = PairingRule(by=pair or "auto", tolerance_ns=tolerance_ns)
+    with quiet_libraries(), closing(open_pairs(rgb, fir, rule, fir_colour="luma")) as pairs:
+        found = aligned(pairs, out, model, matcher, frames, quiet=quiet)
+    if not quiet:
+        print("\n".join(lines_of(found)))
+        print(f"{out} and {picture_of(out)} written: look at the picture before you trust it")
+
+
+def aligned(
+    pairs: Pairs,
+    out: Path,
+    model: Model = "auto",
+    matcher: str = "channels",
+    frames: int = FRAMES,
+    *,
+    quiet: bool,
+) -> Alignment:
+    """Align a few pairs, write the homography `out` and a picture beside it.
+
+    Raises `InputError` where it is not to be trusted: the picture is written all the same, the homography
+    is not.
+    """
+    chosen = _spread(pairs, frames)
+    images = [(frame.bgr, frame.counts) for frame in chosen]
+    with opencv_on_one_thread():
+        found = align(images, model=model, matcher=matcher, progress=None if quiet else _say)
+    title = f"{chosen[0].stem}: {'accepted' if found.accepted else 'refused: ' + found.reason}"
+    drawn = overlay_picture(*images[0], found.H_rgb_fir, title)
+    replace_file(picture_of(out), encode_jpeg(drawn, 90))
+    if not found.accepted:
+        other = "more or sharper frames, point pairs, or a board"
+        hint = f"see {picture_of(out)}; give {other}"
+        raise InputError(f"thermal cannot be laid onto RGB: {found.reason}", hint=hint)
+    write_homography(out, found.registration())
+    return found
+
+
+def _say(step: str) -> None:
+    """What it is at, on a terminal."""
+    if sys.stderr.isatty():
+        print(f"  {step}", file=sys.stderr, flush=True)
+
+
+def picture_of(out: Path) -> Path:
+    return out.with_suffix(".jpg")
+
+
+def lines_of(found: Alignment) -> list[str]:
+    """What came out, for the terminal."""
+    return list(found.registration().notes)
+
+
+def _spread(pairs: Pairs, count: int) -> list[FrameSet]:
+    """Evenly spread pairs that can be read. Raises `InputError` where none can."""
+    chosen, broken = [], []
+    for index in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).astype(int)):
+        try:
+            chosen.append(pairs.read(int(index)))
+        except FrameError as error:
+            broken.append(str(error))
+    if not chosen:
+        raise InputError(f"none of {len(broken)} pairs can be read; the first: {broken[0]}")
+    warn(broken)
+    return chosen
