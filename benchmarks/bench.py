@@ -15,6 +15,7 @@ from pathlib import Path
 
 os.environ.pop("OPENBLAS_CORETYPE", None)  # before numpy is loaded: it would choose another kernel
 
+import calibration
 import compute
 import encoders
 import inprocess
@@ -44,11 +45,12 @@ class Plan:
     help_rounds: int = 11
     lidar_rounds: int = 9
     mine_rounds: int = 3
+    calibration_rounds: int = 5
     warp_rounds: int = 9
     distinct: int = 12
 
 
-QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 4)
+QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 2, 4)
 
 METHOD = """\
 Jobs that are compared run in turn (A B C A B C …) after a warm-up round; every figure is the median of its
@@ -120,6 +122,7 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
     "lidar": _simple(lambda plan, _: lidar.measure(plan.lidar_rounds)),
     "warp": _simple(lambda plan, _: warp.measure(plan.warp_rounds)),
     "mine": _simple(lambda plan, space: mine.measure(space, plan.mine_rounds)),
+    "calibration": _simple(lambda plan, _: calibration.measure(plan.calibration_rounds)),
     "help": _simple(lambda plan, space: memory.measure_start(space, plan.help_rounds)),
 }
 
@@ -144,6 +147,7 @@ def method(plan: Plan) -> str:
         f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders,"
         f" {plan.memory_rounds} of memory, {plan.lidar_rounds} of LiDAR,"
         f" {plan.warp_rounds} of warps from a rig, {plan.mine_rounds} of the mine,"
+        f" {plan.calibration_rounds} of calibration,"
         f" {plan.help_rounds} of start-up"
     )
     return METHOD.format(

@@ -30,7 +30,8 @@ sway_m = 0.0
 turbulence = 0.0
 jerks_per_s = 0.0
 """
-WINDOW = 200, 150  # what is enlarged, px of the frame
+WINDOW = 100, 75  # what is enlarged, px of the frame
+NEAR_M, FAR_M = 4.0, 8.0
 WAYS = {
     "one homography, right at 5 m": ("--homography", "mine/truth/homography_5m.toml"),
     "calibrated rig, 5 m": ("--rig", "rig.toml", "--distance", "5"),
@@ -40,12 +41,17 @@ WAYS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
+    parser.add_argument("out", type=Path, help="the picture to write")
     parser.add_argument("--poses", type=int, default=30)
+    parser.add_argument(
+        "--work", type=Path, help="keep what the commands made here, and do not make it again"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        prepare(folder, options.poses)
+        folder = options.work or Path(name)
+        if not (folder / f"fused{len(WAYS) - 1}").exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            prepare(folder, options.poses)
         options.out.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(options.out), sheet(folder), [cv2.IMWRITE_JPEG_QUALITY, 88])
 
@@ -62,7 +68,7 @@ def prepare(folder: Path, poses: int) -> None:
     run(folder, "depth", "mine/lidar", "-o", "depth", "--rig", "rig.toml", "--quiet")
     for number, way in enumerate(WAYS.values()):
         pair = ("--pair", "stamp", "--tolerance-ms", "60", "--quiet")
-        run(folder, "blend", "mine/rgb", "mine/fir", "-o", f"fused{number}", *pair, *way, "--alpha", "0.6")
+        run(folder, "blend", "mine/rgb", "mine/fir", "-o", f"fused{number}", *pair, *way, "--alpha", "0.5")
 
 
 def run(folder: Path, *arguments: str) -> None:
@@ -71,48 +77,49 @@ def run(folder: Path, *arguments: str) -> None:
 
 
 def sheet(folder: Path) -> Picture:
-    """A column for each way: the frame, and below it a near and a far part twice as large."""
-    stems = set.intersection(
-        *({p.name for p in (folder / f"fused{k}" / "fused").iterdir()} for k in range(len(WAYS)))
-    )
+    """A column for each way: the frame, and below it a near and a far part, enlarged."""
+    stems = set.intersection(*({p.name for p in fused(folder, k).iterdir()} for k in range(len(WAYS))))
     stem = sorted(stems)[len(stems) // 2]
-    frames = [np.array(read(folder / f"fused{k}" / "fused" / stem)) for k in range(len(WAYS))]
-    depth = read(depth_of(folder, stem))
-    near, far = parts(folder, stem, depth)
+    frames = [np.array(read(fused(folder, k) / stem)) for k in range(len(WAYS))]
+    windows = parts(folder, stem, frames)
     columns = []
     for title, frame in zip(WAYS, frames, strict=True):
-        parts_shown = [
-            cv2.resize(cut(frame, at), None, fx=1.6, fy=1.6, interpolation=cv2.INTER_CUBIC)
-            for at in (near, far)
+        shown = [
+            cv2.resize(cut(frame, at), None, fx=3.2, fy=3.2, interpolation=cv2.INTER_CUBIC) for at in windows
         ]
-        for at in (near, far):
+        for at in windows:
             cv2.rectangle(frame, at, (at[0] + WINDOW[0], at[1] + WINDOW[1]), (255, 255, 255), 1)
-        columns.append(np.vstack([titled(frame, title), np.hstack(parts_shown)]))
+        columns.append(np.vstack([titled(frame, title), np.hstack(shown)]))
     return np.hstack(columns)
 
 
-def depth_of(folder: Path, stem: str) -> Path:
-    """The depth map of the nearest stamp."""
-    maps = sorted((folder / "depth" / "depth").iterdir())
-    return min(maps, key=lambda path: abs(int(path.stem) - int(Path(stem).stem)))
+def fused(folder: Path, way: int) -> Path:
+    return folder / f"fused{way}" / "fused"
 
 
 def read(path: Path) -> NDArray[Any]:
     return decode_image(path.read_bytes(), str(path))
 
 
-def parts(folder: Path, stem: str, depth: NDArray[Any]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Top left corners of the windows with the nearest and the farthest depth, where thermal is seen."""
-    mask = read(folder / "fused2" / "mask" / stem)
-    metres = np.where((depth > 0) & (mask > 0), depth / 256.0, np.nan)
-    h, w = metres.shape
-    best: list[tuple[float, tuple[int, int]]] = []
-    for y in range(0, h - WINDOW[1], 15):
-        for x in range(0, w - WINDOW[0], 20):
-            window = metres[y : y + WINDOW[1], x : x + WINDOW[0]]
-            if np.isfinite(window).mean() > 0.85:
-                best.append((float(np.nanmedian(window)), (x, y)))
-    return min(best)[1], max(best)[1]
+def parts(folder: Path, stem: str, frames: list[NDArray[Any]]) -> list[tuple[int, int]]:
+    """Top left corners of a near and a far window: those in which the first and the last way differ most."""
+    maps = sorted((folder / "depth" / "depth").iterdir())
+    counts = read(min(maps, key=lambda path: abs(int(path.stem) - int(Path(stem).stem))))
+    masks = [read(folder / f"fused{k}" / "mask" / stem) > 0 for k in range(len(WAYS))]
+    seen = (counts > 0) & np.logical_and.reduce(masks)
+    metres = np.where(seen, counts / 256.0, np.nan)
+    differ = np.where(seen, np.abs(frames[0].astype(float) - frames[-1]).sum(-1), 0.0)
+    best: dict[str, tuple[float, tuple[int, int]]] = {}
+    for y in range(0, metres.shape[0] - WINDOW[1], 8):
+        for x in range(0, metres.shape[1] - WINDOW[0], 8):
+            inside = np.s_[y : y + WINDOW[1], x : x + WINDOW[0]]
+            if np.isfinite(metres[inside]).mean() < 0.7:
+                continue
+            middle, score = float(np.nanmedian(metres[inside])), float(differ[inside].mean())
+            name = "near" if middle < NEAR_M else "far" if middle > FAR_M else ""
+            if name and score > best.get(name, (0.0, (0, 0)))[0]:
+                best[name] = score, (x, y)
+    return [best[name][1] for name in ("near", "far") if name in best]
 
 
 def cut(frame: Picture, at: tuple[int, int]) -> Picture:

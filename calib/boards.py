@@ -292,7 +292,8 @@ def load_board(path: Path | str) -> Board:
         text = path.read_text(encoding="utf-8") if size <= MAX_CONFIG_BYTES else ""
     except (OSError, UnicodeDecodeError) as error:
         hint = "make one: `fusion calibrate board --help`"
-        raise UsageError(f"no board can be read: {error}", where=path, hint=hint) from None
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise UsageError(f"no board can be read: {why}", where=path, hint=hint) from None
     try:
         if size <= MAX_CONFIG_BYTES and "target_type" in text and "format" not in _first_line(text):
             return _from_kalibr(_yaml(text, path))

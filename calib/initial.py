@@ -6,7 +6,7 @@ start has to be near enough for the solver to fall into the right valley, no mor
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -17,12 +17,12 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 from calib.boards import Board
-from calib.observations import CloudView, View
+from calib.observations import View
 from fusion.errors import UsageError
 from fusion.geometry import FisheyeCamera, Floats, PinholeCamera, invert, pose, transform
 from fusion.rig import RigCamera
 
-MODELS = {"pinhole": 5, "rational": 8, "fisheye": 4}
+MODELS = {"pinhole": 5, "radtan": 4, "rational": 8, "fisheye": 4}
 FEWEST_POINTS = 6  # 4 fix a homography; two more tell whether it is right
 _AMBIGUOUS = 4.0  # times the better pose's rms: the other might still be it
 _FLAT = 0.02  # third singular value of the planes' normals, over the root of their number
@@ -229,7 +229,9 @@ def _coefficients(lens: _Round, views: Sequence[View], model: str) -> tuple[floa
     k1, k2, *rest = np.linalg.lstsq(np.stack(columns, 1), radius - t, rcond=1e-6)[0].tolist()
     if model == "fisheye":
         return (k1, k2, 0.0, 0.0)
-    return (k1, k2, 0.0, 0.0, 0.0, *rest, 0.0) if model == "rational" else (k1, k2, 0.0, 0.0, *rest, 0.0)[:5]
+    if model == "rational":
+        return (k1, k2, 0.0, 0.0, 0.0, *rest, 0.0)
+    return (k1, k2, 0.0, 0.0, *rest, 0.0)[: MODELS[model]]
 
 
 def spread_views(views: Sequence[View], count: int) -> list[View]:
@@ -322,50 +324,3 @@ def refine_link(T_a_b: Floats, T_a_board: Floats, T_b_board: Floats, xyz_m: Floa
         scale = max(1.5 * float(np.median(np.abs(errors(found)))), 1e-9)
         found = least_squares(errors, found, loss="soft_l1", f_scale=scale, max_nfev=30).x
     return T_a_b @ invert(pose(Rotation.from_rotvec(found[:3]).as_matrix(), found[3:]))
-
-
-def lidar_start(
-    T_ref_board: Mapping[str, Floats], clouds: Sequence[CloudView]
-) -> tuple[Floats, float, float] | None:
-    """T_ref_lidar from the boards' planes, and by how much the LiDAR's boards are larger than the camera's.
-
-    Normals give the rotation (Kabsch), distances the translation and one scale; third comes the scale's
-    standard deviation: a board whose spacing is wrong shows as a scale that is not 1. None where the
-    planes do not fix it: fewer than three moments, or normals in one plane.
-    """
-    shared = [
-        (T_ref_board[cloud.moment], _plane(cloud.plane_m)) for cloud in clouds if cloud.moment in T_ref_board
-    ]
-    into = np.array([T[:3, 2] for T, _ in shared]).reshape(-1, 3)  # away from whoever sees the front
-    normals = np.array([n for _, (_, n) in shared]).reshape(-1, 3)
-    middles = np.array([m for _, (m, _) in shared]).reshape(-1, 3)
-    d = np.array([T[:3, 2] @ T[:3, 3] for T, _ in shared])
-    R, t, rows = np.eye(3), np.zeros(3), np.arange(len(shared))
-    for _ in range(4):  # a plane that was something else is far off the others'
-        if len(rows) < 3 or np.linalg.svd(into[rows], compute_uv=False)[2] < _FLAT * np.sqrt(len(rows)):
-            return None
-        left, _, right = np.linalg.svd(into[rows].T @ normals[rows])
-        R = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-        # n . (R m + t) = d: the middle of what the LiDAR saw lies on the plane that the camera sees
-        b = d - (into * (middles @ R.T)).sum(1)
-        t = np.linalg.lstsq(into[rows], b[rows], rcond=None)[0]
-        away = np.abs(into @ t - b) + d * np.linalg.norm(normals @ R.T - into, axis=1)
-        rows = np.flatnonzero(away <= max(4 * np.median(away), 1e-9))
-    return pose(R, t), *_scale(into[rows], d[rows], (into * (middles @ R.T)).sum(1)[rows])
-
-
-def _scale(into: Floats, d: Floats, along: Floats) -> tuple[float, float]:
-    """s of along + into . t = s d, and its sigma; 1 and inf where there are too few."""
-    if len(d) < 6:
-        return 1.0, np.inf
-    A = np.column_stack([into, -d])
-    x, *_ = np.linalg.lstsq(A, -along, rcond=None)
-    noise = np.linalg.norm(A @ x + along) / np.sqrt(len(d) - 4)
-    return float(x[3]), float(noise * np.sqrt(np.linalg.pinv(A.T @ A)[3, 3]))
-
-
-def _plane(xyz: Floats) -> tuple[Floats, Floats]:
-    """Middle and unit normal, away from the sensor, of N x 3 points."""
-    middle = xyz.mean(0)
-    normal = np.linalg.svd(xyz - middle, full_matrices=False)[2][2]
-    return middle, normal if normal @ middle > 0 else -normal

@@ -20,7 +20,6 @@ from fusion.rig import RigCamera
 
 FEWEST_VIEWS = 3
 _LEAST_TILT = np.radians(6)  # between the most different two boards
-_WORST_FOCAL = 0.03  # standard deviation of the focal length, as a share of it
 _FEW_PIXELS = 1.5  # rms above which the lens is likely another one
 _RECORD = "record 15 or more views with the board tilted by 20 to 45 degrees to the left, right, up and down"
 
@@ -28,7 +27,7 @@ _RECORD = "record 15 or more views with the board tilted by 20 to 45 degrees to 
 def calibrate_camera(
     board: Board, views: Sequence[View], model: str = "pinhole", *, progress: Progress | None = None
 ) -> Solution:
-    """The lens of one camera: `model` is pinhole (5 coefficients), rational (8) or fisheye (4).
+    """The lens of one camera: `model` is a row of `calib.initial.MODELS`, with its coefficients.
 
     The camera is its own reference; moments are the views'. Raises `InputError` where no board was found,
     in one or two views only, in images of different sizes, where all views are alike, or where the
@@ -46,7 +45,6 @@ def calibrate_camera(
             solution = _solved(board, views, _better_start(board, views, start), progress)
         except InputError:
             raise error from None
-    _check_focal(name, solution)
     return replace(solution, notes=(*solution.notes, *_likely_causes(name, solution, model)))
 
 
@@ -135,18 +133,15 @@ def _check_tilts(name: str, poses: Sequence[Floats]) -> None:
         raise InputError(f"{what} at most, which leaves the focal length open", where=name, hint=_RECORD)
 
 
-def _check_focal(name: str, solution: Solution) -> None:
-    camera = solution.estimate.cameras[name]
-    sigma = {n: float(s) for n, s in zip(solution.names, np.sqrt(np.diag(solution.covariance)), strict=True)}
-    share = max(sigma.get(f"{name}.fx", 0) / camera.fx, sigma.get(f"{name}.fy", 0) / camera.fy)
-    if not share < _WORST_FOCAL:
-        what = f"the views are too alike: they leave the focal length open by {100 * share:.0f} %"
-        raise InputError(what, where=name, hint=_RECORD)
-
-
 def _likely_causes(name: str, solution: Solution, model: str) -> list[str]:
     rms = solution.rms_px(name)
     if not rms > _FEW_PIXELS:
         return []
-    other = "rational or fisheye" if model == "pinhole" else "fisheye" if model == "rational" else "rational"
+    other = (
+        "rational or fisheye"
+        if model in ("pinhole", "radtan")
+        else "fisheye"
+        if model == "rational"
+        else "rational"
+    )
     return [f"{name}: the {model} model leaves {rms:.1f} px: try {other}, or check that the board is flat"]

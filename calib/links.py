@@ -142,7 +142,7 @@ def _trusted(
     a, b = link.a, link.b
     where = f"{a} and {b}"
     mirrored = _mirrored_link(board, cameras, views, link, poses)
-    if mirrored is not None and mirrored.agreeing > max(0.7 * link.shared, 1.5 * link.agreeing):
+    if mirrored is not None and mirrored.agreeing > 0.7 * link.shared:
         upright = np.trace(mirrored.T_a_b[:2, :2]) > 0
         how = "left-right" if upright else "top-bottom"
         what = f"the images of {b} are mirrored {how} against {a}'s"

@@ -60,7 +60,8 @@ class PairRow:
             text += f", {_ms(self.median_s)} apart (median; at most {_ms(self.largest_s)})"
         elif self.nearest_s is not None:
             text += f", nearest images {_ms(abs(self.nearest_s))} apart (median)"
-            text += f", a tolerance of {self.tolerance_s:g} s would pair them" if self.tolerance_s else ""
+            if self.tolerance_s:
+                text += f", a tolerance of {1e3 * self.tolerance_s:g} ms would pair them"
         return text
 
 

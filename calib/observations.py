@@ -27,7 +27,9 @@ class Detection:
 
     def __post_init__(self) -> None:
         if self.uv.shape != (len(self.ids), 2) or len(np.unique(self.ids)) != len(self.ids):
-            raise ValueError(f"expected N different ids and N x 2 pixels, got {len(self.ids)}, {self.uv.shape}")
+            raise ValueError(
+                f"expected N different ids and N x 2 pixels, got {len(self.ids)}, {self.uv.shape}"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +43,8 @@ class Refusal:
 class View:
     """A board seen by a camera.
 
-    `camera` is its name in the rig (``rgb``, ``fir``). Views and clouds of one `moment` see the board in one pose;
-    where it moved between them, `lag_s` is this view's own stamp minus the moment's stamp, seconds.
+    `camera` is its name in the rig (``rgb``, ``fir``). Views and clouds of one `moment` see the board in
+    one pose; where it moved between them, `lag_s` is this view's own stamp minus the moment's stamp, seconds.
     `size_wh` is the image's size, `file` where it came from.
     """
 
@@ -59,8 +61,8 @@ class View:
 class CloudView:
     """A board seen by a LiDAR: points in metres of the sensor's frame.
 
-    `plane_m` (N, 3) lie on the front; `edge_m` (M, 3) on the rim of the plate, `edge_of` (M,) says on which of its sides: 0 top,
-    1 right, 2 bottom, 3 left of `Board.plate_m`.
+    `plane_m` (N, 3) lie on the front; `edge_m` (M, 3) on the rim of the plate, `edge_of` (M,) says on which
+    of its sides: 0 top, 1 right, 2 bottom, 3 left of `Board.plate_m`.
     """
 
     moment: str

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.boards import Board
-from calib.initial import lidar_start, spread_views
+from calib.initial import spread_views
 from calib.intrinsics import calibrate_camera, check_mirrored
 from calib.links import join_views
-from calib.observations import CloudView, View
+from calib.observations import View
 from calib.solve import Estimate, Solution, solve
 from calib.solve.descent import Progress
 from calib.timing import with_offsets
@@ -34,7 +34,6 @@ def loop_closure(T_a_b: Floats, T_b_c: Floats, T_c_a: Floats) -> tuple[float, fl
 def calibrate_rig(
     board: Board,
     views: Sequence[View],
-    clouds: Sequence[CloudView] = (),
     *,
     models: Mapping[str, str] | None = None,
     known: Mapping[str, RigCamera] | None = None,
@@ -42,7 +41,6 @@ def calibrate_rig(
     reference: str = "rgb",
     timing: Timing = "synchronised",
     moment_ns: Mapping[str, int] | None = None,
-    placed: Mapping[str, Floats] | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Lenses, poses of all sensors in the reference camera's frame, and with timing "offset" the clocks.
@@ -50,16 +48,15 @@ def calibrate_rig(
     `models` by camera (pinhole where it is not said); `known` cameras are held, or refined. "offset"
     estimates one offset to the reference's clock for each other camera from how the board moves; it needs
     `moment_ns`, the stamps of the moments (`Pairing.moment_ns`). The other timings take the board to stand
-    still in each moment. `placed` has T_ref_sensor of LiDARs that have a start; else the boards' planes give
-    it. Raises `InputError` where cameras are not connected, contradict each other, are
-    mirrored or swapped; `UsageError` for what cannot be meant.
+    still in each moment. A LiDAR comes after it: `calib.lidar.lidar_start`, then `solve`. Raises `InputError`
+    where cameras are not connected, contradict each other, are mirrored or swapped; `UsageError` for what
+    cannot be meant.
     """
     models, known = models or {}, known or {}
     by_camera = _by_camera(board, views, models, known, reference)
     cameras, dropped, notes = _lenses(board, by_camera, models, known, progress)
     if timing == "offset":
-        with_clouds = {cloud.moment for cloud in clouds}
-        timed = with_offsets(board, cameras, views, moment_ns or {}, reference, with_clouds)
+        timed = with_offsets(board, cameras, views, moment_ns or {}, reference)
         views, twist, offset_s = timed.views, timed.twist, timed.offset_s
         notes += timed.notes
     else:
@@ -67,18 +64,10 @@ def calibrate_rig(
     joined = join_views(board, cameras, views, reference, moment_ns or {})
     boards, poses = joined.T_ref_board, dict(joined.T_ref_sensor)
     notes += joined.notes
-    for sensor in dict.fromkeys(cloud.sensor for cloud in clouds):
-        if placed and sensor in placed:
-            poses[sensor] = placed[sensor]
-            continue
-        poses[sensor], more = _lidar(boards, [cloud for cloud in clouds if cloud.sensor == sensor])
-        notes += more
     start = Estimate(reference, cameras, poses, boards, twist, offset_s)
     fixed = () if refine_known else tuple(name for name in known if name in cameras)
-    usable = [cloud for cloud in clouds if cloud.moment in boards]
-    solution = solve(board, joined.views, usable, start=start, fixed=fixed, progress=progress)
-    lost = [(c.file or c.moment, "no camera saw the board then") for c in clouds if c.moment not in boards]
-    gone = _once((*dropped, *joined.dropped, *lost, *solution.dropped_views))
+    solution = solve(board, joined.views, start=start, fixed=fixed, progress=progress)
+    gone = _once((*dropped, *joined.dropped, *solution.dropped_views))
     return replace(solution, dropped_views=gone, notes=(*notes, *solution.notes))
 
 
@@ -151,23 +140,5 @@ def _lenses(
             notes.append(f"{name}: its lens starts from {len(few)} of {len(views)} views")
         alone = calibrate_camera(board, few, models.get(name, "pinhole"), progress=progress)
         cameras[name] = alone.estimate.cameras[name]
-        dropped += alone.dropped_views
-        notes += [note for note in alone.notes if note not in notes]
+        dropped += alone.dropped_views  # its notes are superseded by those of the joint solve
     return cameras, dropped, notes
-
-
-# --- the LiDAR
-
-
-def _lidar(boards: Mapping[str, Floats], clouds: Sequence[CloudView]) -> tuple[Floats, list[str]]:
-    sensor, start = clouds[0].sensor, lidar_start(boards, clouds)
-    if start is None:
-        shared = sum(cloud.moment in boards for cloud in clouds)
-        what = f"the board's planes in {shared} clouds do not fix where it is"
-        hint = "at least 3 moments that a camera shares, the board tilted left, right, up or down"
-        raise InputError(what, where=sensor, hint=hint)
-    T, scale, sigma = start
-    if abs(scale - 1) <= max(0.02, 4 * sigma):
-        return T, []
-    said = f"{sensor} sees the board at {100 * scale:.1f} % of the distance that the cameras do"
-    return T, [f"{said}: is its spacing_m {100 * scale:.1f} % of what the board's file says?"]

@@ -78,6 +78,7 @@ class WarpConfig(Group):
 
     homography: str | None = None
     points: str | None = None
+    align: bool = False
     rig: str | None = None
     mode: Literal["infinity", "distance", "depth"] | None = None  # of a rig; None: by what is given
     distance_m: float | None = Field(default=None, gt=0)
@@ -143,7 +144,7 @@ def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
 
 def _checked_warp(warp: WarpConfig, where: str) -> WarpConfig:
     """One way of registering, whole, its mode said."""
-    given = [name for name in ("homography", "points", "rig") if getattr(warp, name)]
+    given = [name for name in ("homography", "points", "align", "rig") if getattr(warp, name)]
     if len(given) > 1:
         raise UsageError(
             f"{given[0]} and {given[1]} exclude each other", where=where, hint="give one of them"

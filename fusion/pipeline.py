@@ -134,7 +134,13 @@ class Fuser:
     `PairsWithDepth`. `registration` is None where a rig registers.
     """
 
-    def __init__(self, pairs: Pairs, config: BlendConfig | None = None, rig: Rig | None = None) -> None:
+    def __init__(
+        self,
+        pairs: Pairs,
+        config: BlendConfig | None = None,
+        rig: Rig | None = None,
+        registration: reg.Registration | None = None,
+    ) -> None:
         self.pairs = pairs
         self.config = config or BlendConfig.of()
         self.rig = self._checked_rig(rig)
@@ -143,7 +149,7 @@ class Fuser:
         thermal, blend = self.config.thermal, self.config.blend
         self.table_bgr = colormap_bgr(thermal.colormap)
         self._blend = blender(blend.method)
-        self._given = self._read_registration()
+        self._given = self._read_registration() if registration is None else registration
         self._warps: dict[Sizes, tuple[reg.Registration | None, AnyWarp]] = {}
         self._lock = threading.Lock()
         self.sizes = self._first_sizes()

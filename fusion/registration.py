@@ -191,10 +191,15 @@ def write_homography(path: Path | str, registration: Registration) -> None:
     How it was found (kind, fit, notes) stands in comments. Raises `UsageError` for a matrix that is
     not finite and `OutputError` where the file cannot be written.
     """
-    import tomlkit
-
     if not np.isfinite(registration.H_rgb_fir).all():
         raise UsageError("a homography with NaN or infinity is not written", where=path)
+    replace_file(Path(path), homography_toml(registration).encode())
+
+
+def homography_toml(registration: Registration) -> str:
+    """The text of `write_homography`'s file."""
+    import tomlkit
+
     document = tomlkit.document()
     for line in (f"kind: {registration.kind}", *_fit_lines(registration.fit), *registration.notes):
         document.add(tomlkit.comment(" ".join(line.split())))
@@ -204,7 +209,7 @@ def write_homography(path: Path | str, registration: Registration) -> None:
         size_wh = getattr(registration, name)
         if size_wh is not None:
             document.add(name, tomlkit.item([int(n) for n in size_wh]))
-    replace_file(Path(path), tomlkit.dumps(document).encode())
+    return tomlkit.dumps(document)
 
 
 def _fit_lines(fit: PointFit | None) -> list[str]:

@@ -110,7 +110,7 @@ def without_board(seed: int, size_wh: tuple[int, int] = (240, 180)) -> NDArray[n
     elif kind == 3:
         value = 60 + 130 * ((x % rng.integers(9, 30) > 3) & (y % rng.integers(9, 30) > 3))
     elif kind == 4:
-        value = 90 + 60 * np.sin(x / rng.uniform(3, 8)) * np.sin(y / rng.uniform(3, 8))
+        value = 90 + 60 * np.sin(x / rng.uniform(2, 4)) * np.sin(y / rng.uniform(2, 4))
     else:
         value = np.full((h, w), 90.0)
         for _ in range(60):

@@ -30,7 +30,11 @@ DOCUMENTS = [
     ROOT / "datasets" / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
-SPOKEN_OF = {"depth.md": "fusion depth cloud.pcd", "mine.md": "fusion simulate mine mine/"}
+SPOKEN_OF = {
+    "depth.md": "fusion depth cloud.pcd",
+    "mine.md": "fusion simulate mine mine/",
+    "calibration.md": "fusion calibrate lidar rgb/ lidar/ --rig rig.toml -o out.toml",
+}
 SHELLS = ("", "sh", "bash", "console")
 
 
@@ -149,7 +153,13 @@ def options_of(*command: str) -> set[str]:
 
 
 OPTIONS = options_of("blend")
-ALL_OPTIONS = OPTIONS | options_of("depth") | options_of("simulate", "mine")
+ALL_OPTIONS = OPTIONS.union(
+    options_of("depth"),
+    options_of("simulate", "mine"),
+    options_of("calibrate", "stereo"),
+    options_of("calibrate", "lidar"),
+    options_of("calibrate", "convert"),
+)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)

@@ -228,5 +228,5 @@ def test_offsets_and_evidence_come_back(tmp_path: Path) -> None:
 def test_an_offset_must_be_a_number(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text('format = "fusion-rig/1"\n[time_offset_s]\nfir = nan\n')
-    with pytest.raises(UsageError, match="time_offset_s.fir"):
+    with pytest.raises(UsageError, match=r"time_offset_s\.fir"):
         load_rig(path)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.align import judge
-from calib.align.channels import Doubles
+from calib.align.channels import Doubles, inverse
 from calib.align.judge import FrameResult
 from calib.align.models import Matches, Model, corner_gap, joined, justified, robust_fit
 from calib.align.pool import (
@@ -36,6 +36,7 @@ from fusion.errors import InputError
 from fusion.registration import Registration
 
 __all__ = ["MATCHERS", "Alignment", "FrameResult", "align"]
+_GLANCE = 96  # pixels of the longer side: enough to tell a mirrored stream
 _TOLERANCE = 1 / 350  # of the RGB image's longer side
 
 
@@ -72,9 +73,7 @@ class Alignment:
             f" correlation {self.score:.2f}, forward-backward gap {self.gap_share:.2%} of the width;"
             " these say that it holds, not how exactly"
         )
-        odd = (
-            f"{frame.name} does not fit the others: {frame.outlier}" for frame in self.frames if frame.outlier
-        )
+        odd = (f"{f.name} does not fit the others: {f.outlier}" for f in self.frames if f.outlier)
         return (found, *odd)
 
     def registration(self) -> Registration:
@@ -82,7 +81,7 @@ class Alignment:
         if not self.accepted:
             raise InputError(
                 f"thermal and RGB could not be aligned: {self.reason}",
-                hint="look at the picture; give more frames with structure that both cameras see, or point pairs",
+                hint="look at the picture; give more frames with structure that both cameras see, or points",
             )
         return Registration(
             self.H_rgb_fir, "homography", self.fir_size_wh, self.rgb_size_wh, notes=self.notes
@@ -115,7 +114,7 @@ def align(
         say("refused; looking whether the thermal stream is mirrored")
         found = _mirrored(frames, way, model, found)
     rgb_size, fir_size = sizes[0]
-    H = np.linalg.inv(to_kept(rgb_size, frames[0].rgb)) @ found.H_rgb_fir @ to_kept(fir_size, frames[0].fir)
+    H = inverse(to_kept(rgb_size, frames[0].rgb)) @ found.H_rgb_fir @ to_kept(fir_size, frames[0].fir)
     larger = rgb_size[0] / frames[0].rgb.shape[1]
     return replace(
         found,
@@ -172,9 +171,9 @@ def _mirrored(
 ) -> Alignment:
     """`refused`, or how the thermal stream must be flipped, where that registers."""
     some = searched(frames)
-    best = {name: search([flipped(f, axes) for f in some])[0].score for name, axes in FLIPS.items()}
+    best = {name: search([flipped(f, axes) for f in some], _GLANCE)[0].score for name, axes in FLIPS.items()}
     name = max(best, key=lambda flip: best[flip])
-    if best[name] <= search(some)[0].score:
+    if best[name] <= search(some, _GLANCE)[0].score:
         return refused
     turned = [flipped(frame, FLIPS[name]) for frame in frames]
     found = _registered(turned, way, model)

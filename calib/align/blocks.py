@@ -1,4 +1,4 @@
-"""What is still missing after a first registration: displacements of blocks, and the map that most agree on."""
+"""What a first registration still lacks: displacements of blocks, and the map that most of them agree on."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Field:
 
 
 def grid_for(H_rgb_fir: Doubles, rgb_shape: tuple[int, ...], fir_shape: tuple[int, ...], width: int) -> Grid:
-    """The RGB rectangle around the projected thermal image; its longer side `width`, enlarged at most 1.5 times."""
+    """The RGB rectangle around the projected thermal image, `width` px long, at most enlarged 1.5 times."""
     xy = project(H_rgb_fir, corners_of(fir_shape))
     h, w = rgb_shape
     low = np.clip(np.floor(xy.min(axis=0)), 0, [w - 1, h - 1])

@@ -8,6 +8,7 @@ of 2, 4 and 6 times the angle, which are orthogonal, hold what eight smooth bins
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from fusion.errors import InputError
 
-Floats = NDArray[np.float32]
+# What OpenCV takes and gives: H x W float32, and masks of uint8.
+Floats = NDArray[Any]
+Mask = NDArray[Any]
 Doubles = NDArray[np.float64]
 
 _WEIGHTS = (1.0, 0.8, 0.5)  # of the three Fourier terms: those of bins 22.5 degrees wide, smoothed once
@@ -29,7 +32,7 @@ class Grey:
     """`pixels` H x W float32 in [0, 1], and `seen` H x W uint8, 255 where they show the scene."""
 
     pixels: Floats
-    seen: NDArray[np.uint8]
+    seen: Mask
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,6 +82,10 @@ def _seen(plane: NDArray) -> NDArray[np.uint8]:
     return content if convex else whole
 
 
+def inverse(matrix: Doubles) -> Doubles:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
 def resized(image: Grey, scale: float) -> tuple[Grey, Doubles]:
     """`image` enlarged by about `scale`, and the 3x3 matrix from its pixels to those of the result."""
     height, width = image.shape
@@ -97,7 +104,7 @@ def warped(image: Grey, matrix: Doubles, size_wh: tuple[int, int]) -> Grey:
     shrink = float(np.sqrt(abs(np.linalg.det(matrix[:2, :2]))))
     if shrink < 0.8:
         image, smaller = resized(image, shrink)
-        matrix = matrix @ np.linalg.inv(smaller)
+        matrix = matrix @ inverse(smaller)
     moved = cv2.warpPerspective(image.pixels, matrix, size_wh, borderMode=cv2.BORDER_REPLICATE)
     return Grey(moved, cv2.warpPerspective(image.seen, matrix, size_wh, flags=cv2.INTER_NEAREST))
 

@@ -37,7 +37,8 @@ def verdict(score: float, gap_share: float) -> str:
         reasons.append(f"the edges agree too little: correlation {score:.2f}, wanted {LEAST_SCORE:.2f}")
     if not gap_share <= LARGEST_GAP:
         reasons.append(
-            f"thermal to RGB and RGB to thermal differ by {gap_share:.1%} of the width, allowed {LARGEST_GAP:.1%}"
+            f"thermal to RGB and RGB to thermal differ by {gap_share:.1%}"
+            f" of the width, allowed {LARGEST_GAP:.1%}"
         )
     return "; ".join(reasons)
 

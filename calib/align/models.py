@@ -9,13 +9,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from calib.align.channels import Doubles
+from calib.align.channels import Doubles, inverse
 
 Model = Literal["similarity", "affine", "homography"]
 MODELS: tuple[Model, ...] = ("similarity", "affine", "homography")
 _LEAST = {"similarity": 2, "affine": 3, "homography": 4}
 # By how much the held-out misfit must fall before the next larger map is taken.
-_GAIN = {"affine": 0.03, "homography": 0.2}
+_GAIN = {"affine": 0.03, "homography": 0.3}
 _FOLDS, _PATCHES = 4, 6
 _LEAST_FOR_CHOICE = 60
 _ROUNDS = 8
@@ -80,7 +80,7 @@ def fit(src: Doubles, dst: Doubles, weight: Doubles, model: Model) -> Doubles:
         raise ValueError(f"the points determine no {model}") from None
     if model == "similarity":
         k = np.array([k[0], -k[1], k[2], k[1], k[0], k[3]])
-    matrix = np.linalg.inv(to_q) @ np.append(k, [0, 0, 1][len(k) - 6 :]).reshape(3, 3) @ to_p
+    matrix = inverse(to_q) @ np.append(k, [0, 0, 1][len(k) - 6 :]).reshape(3, 3) @ to_p
     return matrix / matrix[2, 2]
 
 

@@ -38,14 +38,14 @@ def overlay_picture(rgb: NDArray, fir: NDArray, H_rgb_fir: Doubles, title: str) 
     return np.vstack([head, row])
 
 
-def _bgr8(image: NDArray) -> NDArray[np.uint8]:
+def _bgr8(image: NDArray) -> Floats:
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         return image.copy()
     eight = (255 * grey(image).pixels + 0.5).astype(np.uint8)
     return cv2.cvtColor(eight, cv2.COLOR_GRAY2BGR)
 
 
-def _edges(base: NDArray[np.uint8], heat: Floats, H: Doubles) -> NDArray[np.uint8]:
+def _edges(base: Floats, heat: Floats, H: Doubles) -> Floats:
     """The strongest thermal edges in orange on a dimmed RGB image, and the thermal image's outline."""
     h, w = base.shape[:2]
     smooth = cv2.GaussianBlur(heat, (0, 0), 1.2)
@@ -63,7 +63,7 @@ def _edges(base: NDArray[np.uint8], heat: Floats, H: Doubles) -> NDArray[np.uint
     return out
 
 
-def _checker(base: NDArray[np.uint8], heat: Floats, H: Doubles) -> NDArray[np.uint8]:
+def _checker(base: Floats, heat: Floats, H: Doubles) -> Floats:
     h, w = base.shape[:2]
     eight = cv2.cvtColor((255 * heat + 0.5).astype(np.uint8), cv2.COLOR_GRAY2BGR)
     moved = cv2.warpPerspective(eight, H, (w, h))
@@ -74,7 +74,7 @@ def _checker(base: NDArray[np.uint8], heat: Floats, H: Doubles) -> NDArray[np.ui
     return np.where(thermal[..., None], moved, base)
 
 
-def _named(tile: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+def _named(tile: Floats, name: str) -> Floats:
     cv2.rectangle(tile, (0, 0), (9 * len(name) + 12, 22), (0, 0, 0), -1)
     cv2.putText(tile, name, (6, 16), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return tile

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.align.channels import Doubles, Grey, grey, resized
+from calib.align.channels import Doubles, Grey, grey, inverse, resized
 from calib.align.models import Matches, Model
 from calib.align.refine import Frame, chosen, matched
-from calib.align.search import Candidate, candidates
+from calib.align.search import WIDTH, Candidate, candidates
 from fusion.errors import FusionError, InputError, UsageError
 from fusion.tables import lookup
 
@@ -86,7 +86,7 @@ def by_channels(frames: Sequence[Frame], top: Model) -> BothWays:
     back = [frame.swapped for frame in frames]
     ways = (
         (frames, some, found),
-        (back, [frame.swapped for frame in some], [np.linalg.inv(H) for H in found]),
+        (back, [frame.swapped for frame in some], [inverse(H) for H in found]),
     )
     first, second = (matched(all_, chosen(few, starts), top) for all_, few, starts in ways)
     return first, second
@@ -98,8 +98,8 @@ def searched(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[k] for k in picks]
 
 
-def search(frames: Sequence[Frame]) -> list[Candidate]:
-    return candidates([frame.rgb for frame in frames], [frame.fir for frame in frames])
+def search(frames: Sequence[Frame], width: int = WIDTH) -> list[Candidate]:
+    return candidates([frame.rgb for frame in frames], [frame.fir for frame in frames], width=width)
 
 
 def flipped(frame: Frame, axes: tuple[int, ...]) -> Frame:
@@ -119,7 +119,7 @@ def method(name: str) -> Method:
     if name in MATCHERS:
         return MATCHERS[name]
     foreign: Any = lookup(MATCHERS, "fusion.matchers", name, "matcher")
-    return lambda frames, top: _both_ways(name, foreign, frames)
+    return lambda frames, _: _both_ways(name, foreign, frames)
 
 
 def _both_ways(name: str, matcher: Matcher, frames: Sequence[Frame]) -> BothWays:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from calib.align.blocks import Field, Grid, agree, correlation, field_of, grid_for, on_grid, peaks
-from calib.align.channels import Doubles, Grey
-from calib.align.models import Matches, Model, project
+from calib.align.channels import Doubles, Grey, inverse
+from calib.align.models import Matches, Model, corners_of, project
 
 # Longer side of the working grid, largest displacement looked for, the map, and how far from it, pass after
 # pass, a block's peak still counts; in the grid's pixels.
@@ -40,10 +41,21 @@ def scores(frames: Sequence[Frame], H: Doubles, width: int = JUDGED) -> list[flo
 
 
 def chosen(frames: Sequence[Frame], starts: Sequence[Doubles]) -> Doubles:
-    """Of the candidates the one that, after a first step, correlates best over all frames."""
+    """Of the candidates the one that, after a first step, is least likely by chance, all frames together."""
     better = [_step(frames, H, FIRST) for H in starts]
-    means = [float(np.mean(scores(frames, H, FIRST[0]))) for H in better]
-    return better[int(np.argmax(means))]
+    return better[int(np.argmax([_worth(frames, H) for H in better]))]
+
+
+def _worth(frames: Sequence[Frame], H: Doubles) -> float:
+    """The correlation times the root of the share of the smaller image that both see: a narrow strip that
+    agrees by chance is worth little."""
+    grid = grid_for(H, frames[0].rgb.shape, frames[0].fir.shape, FIRST[0])
+    planes = [on_grid(frame.rgb, frame.fir, H, grid) for frame in frames]
+    both = np.mean([np.count_nonzero(q.any(axis=0)) for _, q in planes])
+    image = float(np.prod(frames[0].rgb.shape))
+    thermal = cv2.contourArea(project(H, corners_of(frames[0].fir.shape)).astype(np.float32))
+    smaller = min(image, thermal) * abs(np.linalg.det(grid.matrix))
+    return float(np.mean([correlation(p, q) for p, q in planes]) * np.sqrt(both / max(smaller, 1.0)))
 
 
 def matched(frames: Sequence[Frame], start: Doubles, top: Model = "affine") -> list[Matches]:
@@ -68,7 +80,7 @@ def _step(frames: Sequence[Frame], H: Doubles, level: Level) -> Doubles:
     """`H` after one level, all frames together."""
     width, reach, model, within = level
     grid, fields = _fields(frames, H, width, reach)
-    better = np.linalg.inv(grid.matrix) @ agree(fields, model, within) @ grid.matrix @ H
+    better = inverse(grid.matrix) @ agree(fields, model, within) @ grid.matrix @ H
     return better / better[2, 2]
 
 
@@ -79,6 +91,6 @@ def _fields(frames: Sequence[Frame], H: Doubles, width: int, reach: int) -> tupl
 
 def _matches(field: Field, moved: Doubles, grid: Grid, H: Doubles, within: float) -> Matches:
     move, weight = peaks(field, project(moved, field.at) - field.at, within)
-    to_rgb = np.linalg.inv(grid.matrix)
-    to_fir = np.linalg.inv(grid.matrix @ H)
+    to_rgb = inverse(grid.matrix)
+    to_fir = inverse(grid.matrix @ H)
     return Matches(project(to_rgb, field.at + move), project(to_fir, field.at), weight)

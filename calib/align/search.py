@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from calib.align.channels import Doubles, Floats, Grey, channels, resized, warped
+from calib.align.channels import Doubles, Floats, Grey, channels, inverse, resized, warped
 from calib.align.models import corner_gap
 
 SCALES = (0.4, 2.5)  # relative to both images stretched to the same longer side
 TURN_DEG = 16.0
-_WIDTH = 144  # pixels of the longer side
+WIDTH = 144  # pixels of the longer side
 _SCALE_STEP, _TURN_STEP_DEG = 1.06, 4.0
 _LEAST_OVERLAP = 0.45  # of the smaller image
 _LEAST_ENERGY = 0.1  # per pixel; flat overlaps never count as agreement
@@ -28,7 +28,7 @@ _APART = 0.06  # of the width: candidates closer than this are one
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """`H_rgb_fir` (3, 3), a similarity, and its correlation times the root of the overlap's area in pixels."""
+    """`H_rgb_fir` (3, 3), a similarity, and its correlation times the root of the overlap in pixels."""
 
     H_rgb_fir: Doubles
     score: float
@@ -45,27 +45,34 @@ class _Side:
     area: float
 
 
-def candidates(rgb: Sequence[Grey], fir: Sequence[Grey], count: int = 5) -> list[Candidate]:
+def candidates(
+    rgb: Sequence[Grey], fir: Sequence[Grey], count: int = 5, width: int = WIDTH
+) -> list[Candidate]:
     """The `count` best similarities that take thermal to RGB, best first, all different.
 
     `rgb` and `fir` are the frames of one rig, each of one size: their correlations are summed. Scales and
     turns are those of `SCALES` and `TURN_DEG`; overlaps of less than 0.45 of the smaller image are not tried.
+    Both are searched with their longer side at `width` pixels.
     """
-    small_rgb, to_rgb = _small(rgb)
-    small_fir, to_fir = _small(fir)
+    small_rgb, to_rgb = _small(rgb, width)
+    small_fir, to_fir = _small(fir, width)
     larger = np.maximum(small_rgb[0].shape, small_fir[0].shape)
-    size = tuple(fft.next_fast_len(int(_ROOM * n), real=True) for n in larger)
-    back = np.linalg.inv(to_rgb)
+    size = _fast(larger[0]), _fast(larger[1])
+    back = inverse(to_rgb)
     found = []
-    for a, b in _sides(small_rgb, small_fir, (size[0], size[1])):
-        score, (x, y) = _best_shift(a, b, (size[0], size[1]))
+    for a, b in _sides(small_rgb, small_fir, size):
+        score, (x, y) = _best_shift(a, b, size)
         shift = np.array([[1, 0, x], [0, 1, y], [0, 0, 1]])
-        found.append(Candidate(back @ np.linalg.inv(a.matrix) @ shift @ b.matrix @ to_fir, score))
+        found.append(Candidate(back @ inverse(a.matrix) @ shift @ b.matrix @ to_fir, score))
     return _different(found, rgb[0].shape, fir[0].shape, count)
 
 
-def _small(images: Sequence[Grey]) -> tuple[list[Grey], Doubles]:
-    both = [resized(image, _WIDTH / max(image.shape)) for image in images]
+def _fast(extent: int) -> int:
+    return int(fft.next_fast_len(int(_ROOM * extent), real=True) or 0)
+
+
+def _small(images: Sequence[Grey], width: int) -> tuple[list[Grey], Doubles]:
+    both = [resized(image, width / max(image.shape)) for image in images]
     return [image for image, _ in both], both[0][1]
 
 
@@ -100,8 +107,9 @@ def _side(images: Sequence[tuple[Grey, Doubles]], size: tuple[int, int]) -> _Sid
     seen = [(image.seen > 0).astype(np.float32) for image, _ in images]
     planes = np.concatenate([channels(i) * s for (i, _), s in zip(images, seen, strict=True)])
     energy = np.einsum("chw,chw->hw", planes, planes)
-    spectra = (fft.rfft2(plane, size) for plane in (planes, energy, np.mean(seen, axis=0)))
-    return _Side(*spectra, images[0][1], float(np.mean(seen, axis=0).sum()))
+    area = np.mean(seen, axis=0)
+    spectra = [np.asarray(fft.rfft2(plane, size)) for plane in (planes, energy, area)]
+    return _Side(spectra[0], spectra[1], spectra[2], images[0][1], float(area.sum()))
 
 
 def _best_shift(a: _Side, b: _Side, size: tuple[int, int]) -> tuple[float, tuple[int, int]]:

@@ -1,14 +1,15 @@
 """Chessboards by saddle points: heated or painted, of either polarity, with hidden parts, cut by the frame.
 
-The image is normalised locally, its saddle points are grown to lattices, and a lattice is laid upon the board's
-pattern. How far a lattice reaches is not taken on trust: a corner that is missing may be covered, washed out or beyond the
-frame. What counts is corners that are there, and places where the squares are seen to end.
+The image is normalised locally, its saddle points are grown to lattices, and a lattice is laid upon the
+board's pattern. How far a lattice reaches is not taken on trust: a corner that is missing may be covered,
+washed out or beyond the frame. What counts is corners that are there, and where squares are seen to end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import cv2
@@ -24,16 +25,18 @@ from calib.observations import Detection, Ids, Refusal
 from fusion.geometry import Floats
 
 _LONG_SIDE_PX = 960  # the search begins in an image at most this long
-_LEAST_CORNERS = 8
+_LEAST_CORNERS, _MOST_LATTICES = 8, 8
 _SHARE_DONE = 0.9  # of the corners in the frame: then no other scale is tried
-# Of the visible corners so many must be there: of those in the frame; of these where lines are missing; of all.
+# So many of the visible corners must be there: in the frame; in the frame where lines are missing; of all.
 _SHARE_IN_FRAME, _SHARE_CUT, _SHARE = 0.6, 0.75, 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """A labelled lattice at one scale; `along` are the edges' directions (rad), `spacing_px` the squares' sides; `share` of the corners that should
-    be in the frame are there.
+    """A labelled lattice at one scale.
+
+    `along` are the edges' directions (rad), `spacing_px` the squares' sides; `share` of the corners that
+    should be in the frame are there.
     """
 
     ids: Ids
@@ -46,9 +49,9 @@ class _Found:
 def find_chessboard(gray: NDArray[Any], board: Board, trace: Trace = SILENT) -> Detection | Refusal:
     """A chessboard's inner corners in `gray` (H x W uint8 or uint16).
 
-    Labels are right up to `board.symmetries()`; of these the one is taken whose rows run most to the right. Points that
-    are hidden by `board.visible` are never told. A board that is cut by the frame or covered is found where the rest says
-    which corners these are; where that is open it is refused, for a wrong label is worse than none.
+    Labels are right up to `board.symmetries()`; of these the one is taken whose rows run most to the right.
+    Points that `board.visible` hides are never told. A board cut by the frame or covered is found where the
+    rest says which corners these are; where that is open it is refused: a wrong label is worse than none.
     Raises `ValueError` for another kind of board or array.
     """
     if board.kind != "chessboard" or gray.ndim != 2 or gray.dtype not in (np.uint8, np.uint16):
@@ -94,10 +97,15 @@ def _search(
     trace.add(f"saddles in the normalised image, sigma {sigma:g}", image, saddles.xy)
     best: _Found | None = None
     reasons = [(0, f"no lattice of corners among {len(saddles)} saddle points")]
-    for lattice in lattices(saddles, max(_LEAST_CORNERS, int(0.2 * board.visible.sum()))):
+    grown = lattices(saddles, max(_LEAST_CORNERS, int(0.2 * board.visible.sum())))
+    for lattice in islice(grown, _MOST_LATTICES):
+        if len(lattice) > 2 * len(board.visible):
+            size = f"{board.cols} x {board.rows}"
+            reasons.append((len(lattice), f"a lattice of {len(lattice)} corners is no board of {size}"))
+            continue
         try:
             sheet = Sheet(lattice, surface, raw)
-            sheet.extend(max(board.cols, board.rows))
+            sheet.extend(max(board.cols, board.rows), 2 * len(board.visible))
             trace.add("lattice", image, sheet.xy)
             placed = _place(sheet, board)
         except ValueError:  # nothing remained of it
@@ -125,7 +133,8 @@ def _place(sheet: Sheet, board: Board) -> _Found | str:
     margin = max(2.0, 0.4 * np.ptp(sheet.cells, axis=0).min())
     rivals = [other for c, _, other in tries[1:] if c < cost + margin]
     if doubts >= margin or any(not _same(ids, other, board) for other in rivals):
-        return f"{what} may lie at several places of the board's {board.cols} x {board.rows}: it is cut or covered"
+        size = f"{board.cols} x {board.rows}"
+        return f"{what} may lie at several places of the board's {size}: it is cut or covered"
     full = set(np.ptp(sheet.cells[ids >= 0], axis=0) + 1) == {board.cols, board.rows}
     before = int((ids >= 0).sum())
     labels = _settle(sheet, board, ids)
@@ -140,23 +149,23 @@ def _place(sheet: Sheet, board: Board) -> _Found | str:
 
 
 def _settle(sheet: Sheet, board: Board, ids: Ids) -> Ids:
-    """With the pattern known: drop what it has not, look again for what it has. Returns the sheet's labels."""
+    """With the pattern known: drop what it has not, look again for what it has; the sheet's labels."""
     keep = ids >= 0
     on_board = np.stack([ids % board.cols, ids // board.cols, np.ones_like(ids)], 1)
     to_cell = np.linalg.lstsq(on_board[keep].astype(float), sheet.cells[keep].astype(float), rcond=None)[0]
     every = np.flatnonzero(board.visible)
     where = np.stack([every % board.cols, every // board.cols, np.ones_like(every)], 1) @ to_cell
     cells = np.round(where).astype(np.intp)
-    sheet.extend(5, cells)
-    label = {cell: k for cell, k in zip(map(tuple, cells.tolist()), every, strict=True)}
+    sheet.extend(5, len(every), cells)
+    label = dict(zip(map(tuple, cells.tolist()), every.tolist(), strict=True))
     return np.array([label[cell] for cell in map(tuple, sheet.cells.tolist())], np.intp)
 
 
 def _placements(sheet: Sheet, board: Board) -> list[tuple[int, int, Ids]]:
     """Ways to lay the sheet upon the pattern, best first.
 
-    Each: corners that speak against it; how many more of the board's corners lie where its squares may end; the
-    label of each of the sheet's corners or -1.
+    Each: corners that speak against it; how many more of the board's corners lie where its squares may end;
+    the label of each of the sheet's corners or -1.
     """
     visible = board.visible.reshape(board.rows, board.cols).astype(np.intp)
     ends = sheet.ends(), sheet.ends(strict=False)
@@ -167,7 +176,7 @@ def _placements(sheet: Sheet, board: Board) -> list[tuple[int, int, Ids]]:
             both = np.stack([-both[:, 1], both[:, 0]], 1)
         both = both - both.min(0)
         kinds = np.repeat([0, 1, 2], [len(sheet), len(ends[0]), len(ends[1])])
-        mask = np.zeros((3, *(both.max(0) + 1)[::-1]), np.intp)
+        mask = np.zeros((3, int(both[:, 1].max()) + 1, int(both[:, 0].max()) + 1), np.intp)
         mask[kinds, both[:, 1], both[:, 0]] = 1
         cost = len(sheet) - correlate2d(visible, mask[0] - mask[1])
         maybe = correlate2d(visible, mask[2] * (1 - mask[1]))
@@ -215,7 +224,8 @@ def _rightmost(ids: Ids, xy: Floats, board: Board) -> Ids:
 def _finish(gray: NDArray[Any], board: Board, found: _Found, scale: float, trace: Trace) -> Detection:
     """Corners refined in the image itself, less those that lie off a smooth surface."""
     xy = (found.xy + 0.5) / scale - 0.5
-    radius = np.clip(0.4 * found.spacing_px / scale, 2.5, 9.0)
+    size = found.spacing_px / scale
+    radius = np.clip(0.4 * size, 2.5, np.maximum(9.0, 0.2 * size))  # large squares may be soft ones
     image = gray.astype(np.float32)
     fitted, _ = fit_corners(image, xy, found.along, radius)
     good = np.isfinite(fitted).all(1)

@@ -31,14 +31,14 @@ _METRICS = 2  # of each
 _SAMPLE = 12  # spots by which a metric is chosen
 _LARGEST = 1.6  # times the board's points: spots of a lattice
 _ARE_CIRCLES = 0.5  # share of a lattice's spots that must be circles
-_ON_BOARD = 0.85  # share of its circles that the board must have
+_ON_BOARD = 0.95  # share of its circles that the board must have
 _EXPLAINED, _EXPLAINED_OF_MEDIAN = 0.35, 0.7  # share of a window's variance that a circle must explain
 _CONTRAST = 0.3  # least contrast, of the median
 _WINDOW = 1.8  # radii
 _ADRIFT = 0.12  # how far a centre may lie off its neighbours' prediction, of the distance of circles
 
 
-_Why = tuple[int, str]  # how many circles there were, and the reason for a refusal
+_Why = tuple[int, str]  # how far a search came, and the reason for a refusal
 
 
 def find_circles(gray: NDArray[Any], board: Board, trace: Trace = SILENT) -> Detection | Refusal:
@@ -93,14 +93,15 @@ def _on_lattice(
     best = placed[0]
     fit = f"a grid of {count} {_name(dark)} circles, of which {best.hits} fit the board"
     needed = max(_LEAST_SHARE * (best.hits + best.misses), _ON_BOARD * count, few)
+    rank = 2 * best.hits - count
     if best.hits < needed:
-        return count, fit
+        return rank, fit
     if not _is_clear(placed, board):
-        return count, f"{fit}, but in more ways than one: is it cut?"
+        return rank, f"{fit}, but in more ways than one: is it cut?"
     there = best.ids >= 0
     known = Known.of(board.points_m[best.ids[there], :2], circles.discs.uv[there], robust=True)
     if known is None:
-        return count, f"{fit}, which no plane explains"
+        return rank, f"{fit}, which no plane explains"
     return _fitted(image, board, known, circles.radius, dark)
 
 
@@ -218,7 +219,7 @@ def _inside(xy: Floats, known: Known, radius: float, shape: tuple[int, ...]) -> 
     rim = radius * np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
     uv = mapped(known.H, (xy[:, None] + rim).reshape(-1, 2)).reshape(len(xy), 4, 2)
     h, w = shape[:2]
-    return ((uv >= 0) & (uv <= (w - 1, h - 1))).all((1, 2))
+    return np.asarray(((uv >= 0) & (uv <= (w - 1, h - 1))).all((1, 2)), np.bool_)
 
 
 def _is_good(discs: Discs, xy: Floats, board: Board, dark: bool) -> NDArray[np.bool_]:
@@ -245,5 +246,5 @@ def _is_good(discs: Discs, xy: Floats, board: Board, dark: bool) -> NDArray[np.b
         *(np.hypot(*(mapped(sure.H, xy + side * a) - mapped(sure.H, xy)).T) for a in np.eye(2))
     )
     near = np.hypot(*(discs.uv - guess).T) < np.maximum(_ADRIFT * distance * scale / side, 1.0)
-    good &= near
+    good[~near] = False
     return good

@@ -1,4 +1,4 @@
-"""From loose saddle points to lattices of corners: seeds, growth, and the smooth surface that a lattice lies on."""
+"""From loose saddle points to lattices of corners: seeds, growth, the smooth surface they lie on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from calib.detect.saddles import Image, Saddles, Surface, fit_corners, look_up
 from fusion.geometry import Floats
@@ -43,10 +43,10 @@ class Lattice:
 
 
 def lattices(saddles: Saddles, least: int, tries: int = 40) -> Iterator[Lattice]:
-    """Lattices of at least `least` corners that share none, from the best seeds on; at most `tries` seeds grow."""
+    """Lattices of at least `least` corners that share none, from the best seeds on; at most `tries` grow."""
     if len(saddles) < least:
         return
-    tree = cKDTree(saddles.xy)
+    tree = KDTree(saddles.xy)
     used = np.zeros(len(saddles), bool)
     for seed in _seeds(saddles, tree):
         if used[list(seed.values())].any():
@@ -61,8 +61,8 @@ def lattices(saddles: Saddles, least: int, tries: int = 40) -> Iterator[Lattice]
             yield Lattice(np.array(list(grown), np.intp), saddles.xy[rows])
 
 
-def _seeds(saddles: Saddles, tree: cKDTree) -> list[dict[Cell, int]]:
-    """Squares of four saddles of alternating orientation; first those whose four neighbours squares stand round, too."""
+def _seeds(saddles: Saddles, tree: KDTree) -> list[dict[Cell, int]]:
+    """Squares of four saddles of alternating orientation; those with other squares about them first."""
     ahead = _ahead(saddles, tree)
     xy = saddles.xy
     quads: list[tuple[NDArray[np.intp], int]] = []
@@ -83,11 +83,10 @@ def _seeds(saddles: Saddles, tree: cKDTree) -> list[dict[Cell, int]]:
     return [dict(zip(cells, (int(k) for k in row), strict=True)) for row, _ in quads]
 
 
-def _ahead(saddles: Saddles, tree: cKDTree) -> NDArray[np.intp]:
-    """(N, 4): the nearest saddle of the other orientation along each of the four edges, clockwise; -1 for none."""
+def _ahead(saddles: Saddles, tree: KDTree) -> NDArray[np.intp]:
+    """(N, 4): the nearest saddle of the other orientation along each of its four edges, or -1."""
     n = len(saddles)
-    gap, near = tree.query(saddles.xy, k=min(_NEIGHBOURS + 1, n))
-    gap, near = gap[:, 1:], near[:, 1:]
+    gap, near = (np.asarray(part)[:, 1:] for part in tree.query(saddles.xy, k=min(_NEIGHBOURS + 1, n)))
     way = saddles.xy[near] - saddles.xy[:, None]
     angle = np.arctan2(way[..., 1], way[..., 0])
     other = np.cos(2 * (saddles.bright[near] - saddles.bright[:, None])) < -0.5
@@ -102,7 +101,7 @@ def _ahead(saddles: Saddles, tree: cKDTree) -> NDArray[np.intp]:
     return result
 
 
-def _grow(saddles: Saddles, tree: cKDTree, seed: dict[Cell, int], used: NDArray[np.bool_]) -> dict[Cell, int]:
+def _grow(saddles: Saddles, tree: KDTree, seed: dict[Cell, int], used: NDArray[np.bool_]) -> dict[Cell, int]:
     """All cells that can be reached from a seed over saddles that are not `used`, ring by ring."""
     held = dict(seed)
     taken = set(held.values()) | set(np.flatnonzero(used).tolist())
@@ -114,7 +113,7 @@ def _grow(saddles: Saddles, tree: cKDTree, seed: dict[Cell, int], used: NDArray[
         wanted = [(cell, *guess) for cell in empty if (guess := _predict(saddles.xy, held, cell))]
         if not wanted:
             break
-        gaps, nearest = tree.query(np.array([place for _, place, _ in wanted]))
+        gaps, nearest = map(np.asarray, tree.query(np.array([place for _, place, _ in wanted])))
         for rank in np.argsort(gaps, kind="stable"):
             (cell, _, size), row = wanted[rank], int(nearest[rank])
             sign = 1 - 2 * (sum(cell) % 2)
@@ -148,10 +147,10 @@ def _predict(xy: Floats, held: dict[Cell, int], cell: Cell) -> tuple[Floats, flo
 
 
 class Sheet:
-    """A lattice held against the image: corners whose four squares alternate as the others' do, on a smooth surface."""
+    """A lattice held against the image: corners on a smooth surface, whose squares alternate."""
 
     def __init__(self, lattice: Lattice, surface: Surface, image: Image) -> None:
-        """`surface` is of the normalised image, `image` the one that came. Raises `ValueError` where too few corners remain."""
+        """`surface` is of the normalised image. Raises `ValueError` where too few corners remain."""
         self._surface, self._image = surface, image
         self._plain = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.float32)
         self.cells, self.xy = lattice.cells, lattice.xy
@@ -171,8 +170,8 @@ class Sheet:
         h, w = self._surface.value.shape
         return h, w
 
-    def extend(self, rounds: int, cells: Cells | None = None) -> None:
-        """Look for the corners that are missing inside and next to the sheet, until there are no more.
+    def extend(self, rounds: int, most: int, cells: Cells | None = None) -> None:
+        """Look for corners that are missing inside and next to the sheet, until there are no more or `most`.
 
         With `cells` (M, 2) those are looked for and no others kept. Raises `ValueError` where too few remain.
         """
@@ -183,7 +182,7 @@ class Sheet:
         for _ in range(rounds):
             wanted = self.beside(within=True) if cells is None else cells[~_within(cells, self.cells)]
             before = len(self)
-            if not len(wanted) or not self._look(wanted):
+            if not len(wanted) or before > most or not self._look(wanted):
                 return
             self._settle()
             if len(self) <= before:
@@ -208,9 +207,10 @@ class Sheet:
         return np.stack([np.arctan2(side[:, 1], side[:, 0]) for side in sides], 1)
 
     def ends(self, strict: bool = True) -> Cells:
-        """Cells beyond the bounding box where squares are seen to end: two alternate before, two beyond are as one of them.
+        """Cells beyond the bounding box where squares are seen to end; not `strict`: where they may.
 
-        A hand over the board, shade or the frame's edge seldom look so; not `strict`: where they may.
+        The two squares before such a cell alternate, the two beyond are as one of these; a hand over the
+        board, shade or the frame's edge seldom look so.
         """
         cells = self.beside(within=False)
         return cells[self._ended(cells, *((1.0, 0.35) if strict else (0.6, 0.7)))]
@@ -278,13 +278,13 @@ class Sheet:
         return (own / typical > _LOW) & (own / typical < 3)
 
     def _alternate(self, cells: Cells, square: Floats) -> NDArray[np.bool_]:
-        """Whether the four squares about cells are bright, dark, bright, dark, about as much as their neighbours."""
+        """Whether the squares about cells are bright and dark in turn, as much as about their neighbours."""
         typical = self._typical(cells, self._contrast)
         apart = np.minimum(square[:, 0], square[:, 3]) - np.maximum(square[:, 1], square[:, 2])
         return (apart > _GAP * typical) & ((square * _COLOUR).mean(1) > 0.3 * typical)
 
     def _squares(self, cells: Cells, shift: Floats | None = None, of: Image | None = None) -> Floats:
-        """(N, 4): brightness of the squares about cells, turned so that all corners should look like _COLOUR."""
+        """(N, 4): brightness of the squares about cells, signed so that all should look like _COLOUR."""
         part = np.minimum(0.3, 8 / np.maximum(self.spacing(cells), 1))[:, None, None]
         at = self.smooth((cells[:, None] + part * _SQUARES).reshape(-1, 2)).reshape(-1, 4, 2)
         value = look_up(
@@ -295,7 +295,7 @@ class Sheet:
 
     def _typical(self, cells: Cells, of: Floats) -> Floats:
         """The median `of` the corners about cells."""
-        _, near = cKDTree(self.cells[: len(of)]).query(cells, k=min(7, len(of)))
+        _, near = KDTree(self.cells[: len(of)]).query(cells, k=min(7, len(of)))
         return np.median(of[near], 1)
 
     def _side(self, cells: Cells | Floats, axis: int) -> Floats:
@@ -305,16 +305,18 @@ class Sheet:
     def _in_frame(self, cells: Cells) -> NDArray[np.bool_]:
         h, w = self.shape
         place, margin = self.smooth(cells), 0.35 * self.spacing(cells)[:, None]
-        return ((place > margin) & (place < (w, h) - margin)).all(1)
+        inside: NDArray[np.bool_] = np.asarray((place > margin) & (place < (w, h) - margin))
+        return inside[:, 0] & inside[:, 1]
 
 
 def _within(cells: Cells, others: Cells) -> NDArray[np.bool_]:
     """Which of `cells` are among `others`."""
-    return (cells[:, None] == others).all(2).any(1)
+    one, two = cells.astype(np.int64) @ (1 << 20, 1), others.astype(np.int64) @ (1 << 20, 1)
+    return np.asarray(np.isin(one, two), np.bool_)
 
 
 class Smooth:
-    """A homography and a polynomial on top, from lattice cells to pixels: a flat board through a real lens."""
+    """A homography and a polynomial on top, from cells to pixels: a flat board through a real lens."""
 
     def __init__(self, cells: NDArray[np.intp] | Floats, xy: Floats) -> None:
         cells = np.asarray(cells, np.float64)

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from calib.detect.saddles_kernels import fit_windows
 from fusion.geometry import Floats
@@ -24,8 +24,11 @@ _RING = np.linspace(0, 2 * np.pi, 24, endpoint=False)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Saddles:
-    """N saddle points: `xy` (N, 2) px; `bright` (N,) rad, the direction in which it is brighter on both sides, mod pi;
-    `half` (N,) rad, the angle from there to either edge between the squares; `strength` (N,), minus the Hessian's determinant.
+    """N saddle points.
+
+    `xy` (N, 2) px; `bright` (N,) rad, the direction in which it is brighter on both sides, modulo pi; `half`
+    (N,) rad, the angle from there to either edge of the squares; `strength` (N,), minus the Hessian's
+    determinant.
     """
 
     xy: Floats
@@ -41,14 +44,14 @@ class Saddles:
 
 
 def normalised(gray: NDArray[Any], sigma_px: float = 15.0) -> Image:
-    """`gray` (H x W, any number type) without its blurred background, divided by its local deviation: H x W float32.
+    """`gray` (H x W of numbers) less its blurred background, by its local deviation: H x W float32.
 
     What is flat to less than half a count stays near 0.
     """
     image = gray.astype(np.float32)
-    flat = image - _wide_blur(image, sigma_px)
-    spread = np.sqrt(_wide_blur(flat * flat, sigma_px) + np.float32(0.25))
-    return flat / spread
+    flat = np.asarray(image - _wide_blur(image, sigma_px), np.float32)
+    power = _wide_blur(np.square(flat, dtype=np.float32), sigma_px)
+    return np.asarray(flat / np.sqrt(power + np.float32(0.25)), np.float32)
 
 
 def _wide_blur(image: Image, sigma_px: float) -> Image:
@@ -62,7 +65,7 @@ def _wide_blur(image: Image, sigma_px: float) -> Image:
 
 
 class Surface:
-    """An image smoothed by `sigma_px`, with its first and second derivatives, to be looked up between pixels."""
+    """An image smoothed by `sigma_px`, with its derivatives, to be looked up between pixels."""
 
     def __init__(self, image: Image, sigma_px: float) -> None:
         self.value = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
@@ -84,13 +87,13 @@ class Surface:
 
     def derivatives(self, xy: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2 at (N, 2) places."""
-        x, y, xx, xy_, yy = (look_up(m, xy) for m in self._maps)
+        x, y, xx, xy_, yy = (look_up(np.asarray(m, np.float32), xy) for m in self._maps)
         return x, y, xx, xy_, yy
 
     def saddles_from(
         self, start: Floats, reach_px: NDArray[Any] | float
     ) -> tuple[Saddles, NDArray[np.bool_]]:
-        """The saddle points next to (N, 2) places, by Newton's method, and which of the N are such within reach."""
+        """The saddle points next to (N, 2) places, by Newton's method, and which are such within reach."""
         xy = start.astype(np.float64)
         step = np.zeros_like(xy)
         for _ in range(5):
@@ -153,19 +156,19 @@ def alternates(surface: Surface, xy: Floats, ring_px: float) -> NDArray[np.bool_
 def _first_of_each(xy: Floats) -> NDArray[np.intp]:
     """Rows of points, of which those that lie within a pixel of an earlier one are left out."""
     keep = np.ones(len(xy), bool)
-    for _, later in sorted(cKDTree(xy).query_pairs(1.0)) if len(xy) else ():
+    for _, later in sorted(KDTree(xy).query_pairs(1.0)) if len(xy) else ():
         keep[later] = False
     return np.flatnonzero(keep)
 
 
 def fit_corners(image: Image, xy: Floats, along: Floats, radius_px: Floats) -> tuple[Floats, Floats]:
-    """Corners of squares to a small part of a pixel: a blurred corner on a sloping background, fitted by least squares.
+    """Corners of squares to a small part of a pixel: a blurred corner on a slope, by least squares.
 
-    About each of N places `xy`, the model is c0 + c . d + A erf(d1 / s) erf(d2 / s) with d the offset from the corner and d1, d2
-    the distances to the two edges, whose directions `along` (N, 2) rad begin the search. Unlike the saddle point itself
-    it is not moved by a glow, whose slope has terms of its own. `radius_px` (N,) is the window's. Returns (N, 2)
-    px and A (N,) in grey levels, positive where it is bright between the first direction and the second. Fits that
-    left a third of their window are NaN in both.
+    About each of N places `xy`, the model is c0 + c . d + A erf(d1 / s) erf(d2 / s) with d the offset from
+    the corner and d1, d2 the distances to its edges, whose directions `along` (N, 2) rad begin the search.
+    Unlike the saddle point itself it is not moved by a glow, whose slope has terms of its own. `radius_px`
+    (N,) is the window's. Returns (N, 2) px and A (N,) in grey levels, whose sign says which two of the four
+    squares are bright. Fits that moved by more than a third of their window are NaN in both.
     """
     start = np.clip(xy, 0, np.array(image.shape[::-1]) - 1.0)
     moved, height = np.zeros((len(xy), 2)), np.zeros(len(xy))

@@ -1,7 +1,7 @@
-"""The least-squares fit of a blurred corner of squares, compiled: small windows, many corners, few parameters.
+"""The least-squares fit of a blurred corner of squares, compiled.
 
-The state of a corner: x and y (px from where the search began), the angles of its two edges (rad), the logarithm of its blur
-(px), then the linear part: grey level, its slopes along x and y, and the step's height.
+The state of a corner: x and y (px from where the search began), the angles of its two edges (rad), the
+logarithm of its blur (px), then the linear part: grey level, its slopes along x and y, and the step's height.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _normal(image, start, radius, state, square, side):
     cos1, sin1, cos2, sin2 = math.cos(state[2]), math.sin(state[2]), math.cos(state[3]), math.sin(state[3])
     blur = math.exp(state[4])
     wide, steep = 1 / (math.sqrt(2) * blur), math.sqrt(2 / math.pi) / blur
-    middle = image[int(round(start[1])), int(round(start[0]))]
+    middle = image[math.floor(start[1] + 0.5), math.floor(start[0] + 0.5)]
     error = 0.0
     for y in range(
         max(math.ceil(start[1] - radius), 0), min(math.floor(start[1] + radius) + 1, image.shape[0])

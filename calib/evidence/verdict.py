@@ -143,7 +143,7 @@ def _pair_grade(
         worst = max(2 * maps[d].worst_px for d in fine)
         good.append(
             f"{what} from {min(fine):g} m on: within {max(sigma[d] for d in fine):.2f} px"
-            f" (at the worst place {worst:.1f} px)"
+            f" at most places, {worst:.1f} px at the worst"
         )
     rest = [distance for distance, px in sigma.items() if px > GOOD_PX]
     if rest:

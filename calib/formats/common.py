@@ -34,7 +34,7 @@ class Asked:
         if name in self.size_wh:
             return self.size_wh[name]
         what = "the calibration does not say how large the pictures are"
-        hint = f"say width and height of camera {name} (size_wh)"
+        hint = f"give width and height of {name}'s images (size_wh; converting: --size, checking: --{name})"
         raise UsageError(what, where=path, hint=hint)
 
 
@@ -138,7 +138,7 @@ def padded(camera: RigCamera, count: int, form: str, name: str) -> tuple[float, 
     D = tuple(float(k) for k in camera.distortion)
     if any(D[count:]):
         what = f"{form} takes {count} distortion coefficients; camera {name} has {len(D)}"
-        raise UsageError(what, hint="calibrate it with fewer, or write another form")
+        raise UsageError(what, hint="calibrate it with --model radtan, or write another form")
     return (D + (0.0,) * count)[:count]
 
 

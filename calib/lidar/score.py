@@ -44,8 +44,8 @@ def scene_edges(xyz_m: Floats, intensity: NDArray[Any] | None) -> SceneEdges:
     ray = xyz_m / range_m[:, None]
     if len(xyz_m) <= _NEIGHBOURS:
         return _none()
-    found = KDTree(ray).query(ray, _NEIGHBOURS)
-    gap, near = (np.asarray(part)[:, 1:] for part in found)
+    found: Any = KDTree(ray).query(ray, _NEIGHBOURS)
+    gap, near = found[0][:, 1:], found[1][:, 1:]
     usual = float(np.median(gap[:, 0]))
     close = (gap < 12 * usual) & (gap > 0)
     rise = np.where(close, range_m[near] - range_m[:, None], 0.0)

@@ -16,6 +16,11 @@ _OUTLIER = 5.0  # of normal points in an image, four in a million lie farther ou
 _MIN_POINTS, _MIN_SHARE = 4, 0.5
 _VIEW_RATIO, _VIEW_MADS, _MIN_VIEWS = 2.5, 6.0, 4
 # Noise is never believed to be less: no corner, no laser is better, and nothing is divided by nothing.
+_HARMLESS = {
+    "px": 0.1,
+    "plane": 0.005,
+    "edge": 0.01,
+}  # errors for which no view goes, however good the others are
 FLOOR = {"px": 1e-6, "plane": 1e-6, "edge": 1e-6}
 
 
@@ -62,7 +67,7 @@ def poor_parts(block: Block, r: Floats, used: Mask) -> dict[int, str]:
     values = np.array(list(error.values()))
     middle = max(float(np.median(values)), 10 * FLOOR[block.kind])
     spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
-    limit = max(_VIEW_RATIO * middle, middle + _VIEW_MADS * spread)
+    limit = max(_VIEW_RATIO * middle, middle + _VIEW_MADS * spread, _HARMLESS[block.kind])
     return few | {
         i: f"half its points are off by more than {value:.2g} {_unit(block)}; in the others {middle:.2g}"
         for i, value in error.items()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from calib.align import Alignment, align
+from calib.align import align
 from calib.align.picture import overlay_picture
 from fusion.batch import opencv_on_one_thread
 from fusion.cli.running import quiet_libraries, refuse_existing, warn
@@ -18,11 +19,19 @@ from fusion.errors import FrameError, InputError, UsageError
 from fusion.files import replace_file
 from fusion.frames import FrameSet
 from fusion.pairing import PairingRule
-from fusion.registration import write_homography
+from fusion.registration import Registration, write_homography
 from fusion.sync import Pairs, open_pairs
 
 Model = Literal["auto", "similarity", "affine", "homography"]
 FRAMES = 8  # pairs that are pooled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """An alignment that may be used, and the picture that shows it."""
+
+    registration: Registration
+    picture_jpg: bytes
 
 
 def run_align(
@@ -41,57 +50,50 @@ def run_align(
     if frames < 1:
         raise UsageError(f"{frames} frames", where="--frames", hint="at least 1")
     refuse_existing(out, overwrite)
+    picture = out.with_suffix(".jpg")
     tolerance_ns = None if tolerance_ms is None else round(tolerance_ms * 1e6)
     rule = PairingRule(by=pair or "auto", tolerance_ns=tolerance_ns)
     with quiet_libraries(), closing(open_pairs(rgb, fir, rule, fir_colour="luma")) as pairs:
-        found = aligned(pairs, out, model, matcher, frames, quiet=quiet)
+        found = aligned(pairs, model, matcher, frames, quiet=quiet, refused=picture)
+    replace_file(picture, found.picture_jpg)
+    write_homography(out, found.registration)
     if not quiet:
-        print("\n".join(lines_of(found)))
-        print(f"{out} and {picture_of(out)} written: look at the picture before you trust it")
+        print("\n".join(found.registration.notes))
+        print(f"{out} and {picture} written: look at the picture before you trust it")
 
 
 def aligned(
     pairs: Pairs,
-    out: Path,
     model: Model = "auto",
     matcher: str = "channels",
     frames: int = FRAMES,
     *,
     quiet: bool,
-) -> Alignment:
-    """Align a few pairs, write the homography `out` and a picture beside it.
+    refused: Path | None = None,
+) -> Aligned:
+    """Align a few pairs, evenly spread.
 
-    Raises `InputError` where it is not to be trusted: the picture is written all the same, the homography
-    is not.
+    Raises `InputError` where the result is not to be trusted; its picture is written to `refused`.
     """
     chosen = _spread(pairs, frames)
     images = [(frame.bgr, frame.counts) for frame in chosen]
     with opencv_on_one_thread():
         found = align(images, model=model, matcher=matcher, progress=None if quiet else _say)
     title = f"{chosen[0].stem}: {'accepted' if found.accepted else 'refused: ' + found.reason}"
-    drawn = overlay_picture(*images[0], found.H_rgb_fir, title)
-    replace_file(picture_of(out), encode_jpeg(drawn, 90))
-    if not found.accepted:
-        other = "more or sharper frames, point pairs, or a board"
-        hint = f"see {picture_of(out)}; give {other}"
-        raise InputError(f"thermal cannot be laid onto RGB: {found.reason}", hint=hint)
-    write_homography(out, found.registration())
-    return found
+    drawn = encode_jpeg(overlay_picture(*images[0], found.H_rgb_fir, title), 90)
+    if found.accepted:
+        return Aligned(found.registration(), drawn)
+    hint = "give more or sharper frames, point pairs, or a board"
+    if refused is not None:
+        replace_file(refused, drawn)
+        hint = f"see {refused}; {hint}"
+    raise InputError(f"thermal cannot be laid onto RGB: {found.reason}", hint=hint)
 
 
 def _say(step: str) -> None:
     """What it is at, on a terminal."""
     if sys.stderr.isatty():
         print(f"  {step}", file=sys.stderr, flush=True)
-
-
-def picture_of(out: Path) -> Path:
-    return out.with_suffix(".jpg")
-
-
-def lines_of(found: Alignment) -> list[str]:
-    """What came out, for the terminal."""
-    return list(found.registration().notes)
 
 
 def _spread(pairs: Pairs, count: int) -> list[FrameSet]:

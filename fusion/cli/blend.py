@@ -76,6 +76,9 @@ def blend(
     points: Annotated[
         str | None, Parameter(group=WARP, help="CSV of matching points: fir_x,fir_y,rgb_x,rgb_y.")
     ] = None,
+    align: Annotated[
+        bool | None, Parameter(group=WARP, help="Find where thermal lies from the scene alone; no board.")
+    ] = None,
     rig: Annotated[
         str | None, Parameter(group=WARP, help="Calibration of both cameras: rig.toml, or another tool's.")
     ] = None,

@@ -7,9 +7,9 @@ import io
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from fusion.manifest import Manifest, load_manifest
 from fusion.pairing import report_lines
 from fusion.pipeline import Fuser, PairsWithDepth
 from fusion.provenance import describe_run
+from fusion.registration import homography_toml
 from fusion.report.sheet import contact_sheet
 from fusion.report.text import closing_lines, plan_lines, warnings_of
 from fusion.rig import Rig
@@ -34,6 +35,9 @@ from fusion.sinks.depth import PER_METRE
 from fusion.sinks.folder import FolderSink
 from fusion.sources import Source, open_source
 from fusion.sync import Pairs, open_pairs
+
+if TYPE_CHECKING:
+    from fusion.cli.aligning import Aligned
 
 PREVIEW = "preview.png"
 
@@ -56,6 +60,7 @@ PLACES = {
     "fir_colour": ("thermal", "fir_colour"),
     "homography": ("warp", "homography"),
     "points": ("warp", "points"),
+    "align": ("warp", "align"),
     "rig": ("warp", "rig"),
     "warp": ("warp", "mode"),
     "distance": ("warp", "distance_m"),
@@ -96,13 +101,15 @@ def run_blend(
         )
     manifest, rig = manifest_of(dataset, settings, inputs), rig_of(settings)
     with quiet_libraries(), ExitStack() as open_things:
-        pairs = open_inputs(settings, inputs, manifest)
+        pairs = open_inputs(settings, inputs, manifest, rig)
         open_things.callback(pairs.close)
         report_pairing(pairs, settings.strict, show=dry_run)
         depth = depth_of(settings, pairs, rig, open_things)
         if out is None or (dry_run and not preview):
             return
-        fuser = Fuser(pairs if depth is None else PairsWithDepth(pairs, depth), settings, rig)
+        alignment = align_pairs(pairs, quiet=quiet) if settings.warp.align else None
+        registration = None if alignment is None else alignment.registration
+        fuser = Fuser(pairs if depth is None else PairsWithDepth(pairs, depth), settings, rig, registration)
         warn([*unlike_the_manifest(manifest, pairs), *fuser.notes, *(depth.notes if depth else [])])
         if dry_run:
             replace_file(out / PREVIEW, _preview_png(fuser))
@@ -113,6 +120,9 @@ def run_blend(
         with _sink(fuser, out, overwrite) as sink:
             if preview:
                 sink.write_file(PREVIEW, _preview_png(fuser))
+            if alignment is not None:
+                sink.write_file("alignment.toml", homography_toml(alignment.registration).encode())
+                sink.write_file("alignment.jpg", alignment.picture_jpg)
             with progress_bar("fusing", quiet) as progress:
                 report = run(fuser, sink, workers=threads, progress=progress)
             if pairs.pairing.unmatched:
@@ -120,6 +130,13 @@ def run_blend(
         if not quiet:
             print("\n".join(closing_lines(fuser, report, out)))
         warn(warnings_of(fuser, report))
+
+
+def align_pairs(pairs: Pairs, *, quiet: bool) -> Aligned:
+    """Where thermal lies on RGB, from the scene alone. Raises `InputError` where it cannot be told."""
+    from fusion.cli.aligning import aligned
+
+    return aligned(pairs, quiet=quiet)
 
 
 def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str]) -> Manifest | None:
@@ -131,23 +148,27 @@ def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str
         raise UsageError("a data set has one root", where="--dataset", hint=hint)
     manifest = load_manifest(dataset)
     warp = settings.warp
-    if not manifest.registered and not (warp.homography or warp.points or warp.rig):
+    if not manifest.registered and not (warp.homography or warp.points or warp.align or warp.rig):
         raise InputError(
             "its thermal images are not registered to its RGB images: as they are, they do not fit",
             where=f"data set {manifest.name}",
-            hint="give --rig FILE, --homography FILE or --points CSV",
+            hint="give --rig FILE, --homography FILE, --points CSV, or --align",
         )
     return manifest
 
 
-def open_inputs(settings: BlendConfig, inputs: Sequence[str], manifest: Manifest | None) -> Pairs:
-    """The pairs of two inputs, of one 4-channel input, or of a data set's root."""
-    rule, fir_colour = settings.pairing.rule(), settings.thermal.fir_colour
+def open_inputs(
+    settings: BlendConfig, inputs: Sequence[str], manifest: Manifest | None, rig: Rig | None = None
+) -> Pairs:
+    """The pairs of two inputs, of one 4-channel input, or of a data set's root; by the clocks of the rig."""
+    offset_s = {} if rig is None else rig.time_offset_s
+    offset_ns = round(1e9 * (offset_s.get("fir", 0.0) - offset_s.get("rgb", 0.0)))
+    rule, fir_colour = replace(settings.pairing.rule(), fir_offset_ns=offset_ns), settings.thermal.fir_colour
     if manifest is None:
         return open_pairs(inputs[0], inputs[1] if len(inputs) == 2 else None, rule, fir_colour=fir_colour)
     rgb, fir = manifest.globs(inputs[0])
     if not settings.pairing.model_fields_set:
-        rule = manifest.pairing_rule(inputs[0])
+        rule = replace(manifest.pairing_rule(inputs[0]), fir_offset_ns=offset_ns)
     return open_pairs(rgb, fir, rule, fir_colour=fir_colour)
 
 

@@ -13,7 +13,7 @@ PAIRS = Group("Which views belong together", sort_key=3)
 OUTPUT = Group("Output", sort_key=4)
 RUN = Group("Run", sort_key=5)
 
-LensModel = Literal["pinhole", "rational", "fisheye"]
+LensModel = Literal["pinhole", "radtan", "rational", "fisheye"]
 
 BoardFile = Annotated[
     Path, Parameter(name="--board", group=BOARD, help="TOML of the board, or Kalibr's target YAML.")
@@ -46,7 +46,9 @@ Refine = Annotated[
         help="Refine the cameras of --rig, or hold them. Default: held where they are from more views.",
     ),
 ]
-_MODEL_HELP = "pinhole (5 coefficients), rational (8), or fisheye (Kannala-Brandt, 4)."
+_MODEL_HELP = (
+    "pinhole (5 coefficients), radtan (4, as Kalibr has), rational (8), or fisheye (Kannala-Brandt, 4)."
+)
 
 
 def calibrate_board(
@@ -57,19 +59,21 @@ def calibrate_board(
         Path | None, Parameter(group=BOARD, help="Print this board (TOML, or Kalibr's target YAML).")
     ] = None,
     kind: Annotated[
-        Literal["chessboard", "charuco", "aprilgrid", "circles", "asymmetric-circles"],
-        Parameter(group=BOARD, help="What is printed on it."),
-    ] = "chessboard",
+        Literal["chessboard", "charuco", "aprilgrid", "circles", "asymmetric-circles"] | None,
+        Parameter(group=BOARD, help="What is printed on it. Default: chessboard."),
+    ] = None,
     cols: Annotated[
-        int,
+        int | None,
         Parameter(
-            group=BOARD, help="chessboard: inner corners a row; charuco: squares; else tags or circles."
+            group=BOARD,
+            help="chessboard: inner corners a row; charuco: squares; else tags or circles. Default: 9.",
         ),
-    ] = 9,
-    rows: Annotated[int, Parameter(group=BOARD, help="The same, down.")] = 6,
+    ] = None,
+    rows: Annotated[int | None, Parameter(group=BOARD, help="The same, down. Default: 6.")] = None,
     spacing_mm: Annotated[
-        float, Parameter(group=BOARD, help="From one corner, circle or tag to the next.")
-    ] = 30.0,
+        float | None,
+        Parameter(group=BOARD, help="From one corner, circle or tag to the next. Default: 30."),
+    ] = None,
     marker_mm: Annotated[
         float | None, Parameter(group=BOARD, help="Side of a code's square. Default: 0.75 of the spacing.")
     ] = None,
@@ -81,7 +85,8 @@ def calibrate_board(
     """Print a board to scale."""
     from fusion.cli import calibration_files as files
 
-    files.run_board(out, board, kind, cols, rows, spacing_mm, marker_mm, dictionary, overwrite=overwrite)
+    made = files.Made(kind, cols, rows, spacing_mm, marker_mm, dictionary)
+    files.run_board(out, board, made, overwrite=overwrite)
 
 
 def calibrate_intrinsics(
@@ -232,7 +237,7 @@ def calibrate_convert(
     /,
     *,
     form: Annotated[
-        str | None, Parameter(help="rig, kalibr, ros, opencv, kitti-raw, kitti-object, koide3, plain.")
+        str | None, Parameter(help="rig, kalibr, ros, opencv, kitti (object), kitti-raw, koide, plain.")
     ] = None,
     size: Annotated[
         tuple[int, int] | None,
@@ -241,9 +246,12 @@ def calibrate_convert(
     names: Annotated[
         tuple[str, ...] | None, Parameter(help="What the source's cameras are called here, in its order.")
     ] = None,
+    force: Annotated[
+        bool, Parameter(help="KITTI's forms: leave the distortion out; the images must be undistorted too.")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """A calibration in another tool's form."""
     from fusion.cli import calibration_files as files
 
-    files.run_convert(source, out, form, size, names, overwrite=overwrite)
+    files.run_convert(source, out, form, size, names, force=force, overwrite=overwrite)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from calib.detect.folder import Found, ImageRef, find_in_images
 from calib.evidence.linear import with_held
 from calib.evidence.verdict import Evidence, gather
 from calib.intrinsics import calibrate_camera
-from calib.moments import Shot, pair
+from calib.moments import Pairing, Shot, pair
 from calib.observations import Detection, View
 from calib.report.page import page
 from calib.report.pictures import (
@@ -28,11 +29,13 @@ from calib.report.pictures import (
 )
 from calib.report.record import known_covariance, rig_of, views_behind
 from calib.report.text import closing_lines
+from calib.rigging import calibrate_rig
 from calib.solve.estimate import Solution
+from calib.still import pair_still
 from fusion.batch import opencv_on_one_thread
 from fusion.cli.running import progress_bar, quiet_libraries, refuse_existing, threads_of, warn
 from fusion.codecs import encode_jpeg
-from fusion.errors import InputError, UsageError
+from fusion.errors import FrameError, InputError, UsageError
 from fusion.files import replace_file
 from fusion.pairing import stamps_of
 from fusion.rig import Rig, load_rig, save_rig
@@ -76,6 +79,8 @@ class Together:
 
     def options(self) -> dict[str, Any]:
         by = "name" if self.by == "stem" else self.by
+        if self.tolerance_ms is not None and not 0 < self.tolerance_ms < math.inf:
+            raise UsageError(f"{self.tolerance_ms:g} ms", where="--tolerance-ms", hint="above 0")
         return {"by": by, **({} if self.tolerance_ms is None else {"tolerance_s": self.tolerance_ms / 1000})}
 
 
@@ -87,6 +92,7 @@ class Desk:
             raise UsageError("no board is given", where="--board", hint="fusion calibrate board makes one")
         refuse_existing(asked.out, asked.overwrite)
         self.asked, self.board = asked, load_board(asked.board)
+        asked.known()  # a rig that cannot be read is said before the search, not after it
         self.sources: dict[str, Source] = {}
         self.shots: dict[str, list[Shot]] = {}
         self._open = ExitStack()
@@ -159,14 +165,21 @@ class Desk:
         for f in without[:_NAMED]:
             print(f"  no board in {f.name}: {f.result.reason}")  # type: ignore[union-attr]
         if len(without) > _NAMED:
-            print(f"  and {len(without) - _NAMED} more: the report names all, --debug draws them")
+            named = ", the report names all" if seen and self.asked.report else ""
+            print(f"  and {len(without) - _NAMED} more: {self._drawn(camera)}{named}")
+
+    def _drawn(self, camera: str) -> str:
+        folder = self.asked.folder / "debug" / camera
+        return f"{folder} shows what was tried" if self.asked.debug else "--debug draws what was tried"
 
     def _refuse_nothing(self, camera: str, spec: str, found: Sequence[Found]) -> None:
-        if any(isinstance(f.result, Detection) for f in found):
-            return
         reasons = [f.result.reason for f in found if not isinstance(f.result, Detection)]
-        common = max(set(reasons), key=reasons.count)
-        hint = f"most often: {common}; is the board {self.board}? --debug draws what was tried"
+        common = max(reasons, key=reasons.count, default="")
+        if len(reasons) < len(found):
+            if 2 * len(reasons) > len(found):
+                warn([f"{camera}: no board in {len(reasons)} of {len(found)} images; most often: {common}"])
+            return
+        hint = f"most often: {common}; is the board {self.board}? {self._drawn(camera)}"
         raise InputError(f"no board in any of {len(found)} images of {camera}", where=spec, hint=hint)
 
 
@@ -200,15 +213,15 @@ def run_stereo(
     together: Together,
     refine: bool | None,
 ) -> None:
+    together.options()  # what cannot be is said before the search
     with Desk(asked) as desk:
+        refuse_swapped(images)
         for camera, spec in images.items():
             desk.look(camera, spec)
-        pairing = pair(desk.shots, **together.options())
+        pairing = _paired(desk, together)
         if not asked.quiet:
             print(pairing.table())
         warn(pairing.notes)
-        from calib.rigging import calibrate_rig
-
         known = {name: lens for name, lens in asked.known().cameras.items() if name in images}
         held = hold(asked.known(), pairing.views, list(images), refine)
         say_held(asked, known, held)
@@ -220,9 +233,38 @@ def run_stereo(
                 known=known,
                 refine_known=not held,
                 timing=together.timing,
+                moment_ns=pairing.moment_ns,
                 progress=progress,
             )
         finish(desk, solution, fixed=tuple(known) if held else ())
+
+
+def refuse_swapped(images: Mapping[str, str]) -> None:
+    """Raises `InputError` where the RGB images are 16-bit grey and the thermal ones 8-bit colour."""
+    first = {}
+    for camera, spec in images.items():
+        roles: tuple[Role, ...] = ("rgb", "fir")
+        for role in roles:
+            with closing(open_source(spec, role, fir_colour="luma")) as source:
+                try:
+                    first[camera, role] = source.read(0).pixels
+                except FrameError:  # told when its turn comes
+                    return
+    deep = {camera: first[camera, "fir"].dtype == np.uint16 for camera in images}
+    coloured = {camera: bool(np.ptp(first[camera, "rgb"], axis=2).any()) for camera in images}
+    if deep["rgb"] and not coloured["rgb"] and coloured["fir"] and not deep["fir"]:
+        what = "RGB images are 16-bit grey, thermal ones 8-bit and coloured: are the folders swapped?"
+        raise InputError(what, where=images["rgb"], hint="RGB comes first, then thermal")
+
+
+def _paired(desk: Desk, together: Together) -> Pairing:
+    """Views of both cameras by moment; where clocks are apart, of a board that stood still."""
+    options = together.options()
+    if together.timing != "static":
+        return pair(desk.shots, **options)
+    by = "order" if together.by == "order" else "stamp"
+    margin = {"margin_s": options["tolerance_s"]} if "tolerance_s" in options else {}
+    return pair_still(desk.board, desk.shots, by=by, **margin)
 
 
 def hold(known: Rig, views: Sequence[View], cameras: Sequence[str], refine: bool | None) -> bool:

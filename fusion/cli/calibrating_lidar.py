@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.lidar.scale import board_scale, spacing_note
 from calib.lidar.start import lidar_start
 from calib.moments import Pairing, Shot, pair
 from calib.observations import Detection, View
@@ -47,6 +48,8 @@ def run_lidar(
     if points is not None and asked.board is not None:
         raise UsageError("either points or a board", where="--points", hint="leave one out")
     if asked.board is None:
+        if fir is not None:
+            raise UsageError("thermal images serve only with a board", where="--fir", hint="give --board")
         from fusion.cli import calibrating_scene as scene
 
         if points is not None:
@@ -62,11 +65,11 @@ def _by_board(
     asked: Asked, specs: Mapping[str, str], files: CloudFiles, together: Together, refine: bool | None
 ) -> None:
     rig = asked.known()
-    known = {name: rig.camera(name) for name in specs}
+    known, options = {name: rig.camera(name) for name in specs}, together.options()
     with Desk(asked) as desk:
         for camera, spec in specs.items():
             desk.look(camera, spec)
-        pairing = pair({**desk.shots, LIDAR: _cloud_shots(files)}, **together.options())
+        pairing = pair({**desk.shots, LIDAR: _cloud_shots(files)}, **options)
         if not asked.quiet:
             print(pairing.table())
         warn(pairing.notes)
@@ -98,22 +101,28 @@ def _cloud_shots(files: CloudFiles) -> list[Shot]:
 
 
 def _read(pairing: Pairing) -> Clouds:
-    """The clouds that belong to a moment. Raises `InputError` where there is none."""
+    """The clouds of moments in which a camera saw the board. Raises `InputError` where there is none."""
+    seen = {view.moment for view in pairing.views if view.camera != LIDAR}
     xyz, rings, files, broken = {}, {}, {}, []
     for view in pairing.views:
-        if view.camera == LIDAR:
+        if view.camera == LIDAR and view.moment in seen:
             try:
                 cloud = read_cloud(view.file)
             except FrameError as error:
                 broken.append(str(error))
                 continue
+            if not np.isfinite(cloud.xyz_m).all(1).any():
+                broken.append(f"{view.file}: no point of it is a number")
+                continue
             xyz[view.moment], files[view.moment] = cloud.xyz_m, view.file
             if "ring" in cloud.fields:
                 rings[view.moment] = cloud.fields["ring"]
+    if broken and not xyz:
+        raise InputError(f"none of {len(broken)} clouds can be used; the first: {broken[0]}")
     warn(broken)
     if not xyz:
         hint = f"{pairing.table()}; --tolerance-ms or --pair order may help"
-        raise InputError("no cloud belongs to any image", hint=hint)
+        raise InputError("no cloud belongs to an image that shows the board", hint=hint)
     return Clouds(xyz, rings, files)
 
 
@@ -144,7 +153,14 @@ def _with_lidar(
     joint = solve(
         desk.board, solution.views, start.views, start=replace(estimate, T_ref_sensor=poses), fixed=fixed
     )
+    warn(
+        [note]
+        if (note := spacing_note(*board_scale(estimate.T_ref_board, start.T_ref_lidar, start.views)))
+        else []
+    )
     lost = [(Path(clouds.files[moment]).name, why) for moment, why in start.dropped]
+    apart = "the board's pose in the cameras is not known"
+    lost += [(Path(clouds.files[moment]).name, apart) for moment in clouds.xyz_m.keys() - usable.keys()]
     return replace(joint, dropped_views=(*solution.dropped_views, *lost, *joint.dropped_views))
 
 

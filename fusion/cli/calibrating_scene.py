@@ -18,7 +18,7 @@ from fusion.cli.calibrating import Asked, Together
 from fusion.cli.running import progress_bar, quiet_libraries, refuse_existing, warn
 from fusion.clouds import clouds_in, read_cloud
 from fusion.codecs import encode_jpeg
-from fusion.errors import FrameError, InputError
+from fusion.errors import FrameError, InputError, UsageError
 from fusion.files import replace_file
 from fusion.frames import PointCloud
 from fusion.geometry import Floats
@@ -43,9 +43,7 @@ def run_points(asked: Asked, camera: str, points: Path) -> None:
         print(f"{found.inliers.sum()} of {len(found.inliers)} pairs, rms {found.rms_px:.2f} px")
         if left_out:
             print(f"left out: lines {', '.join(left_out)} of {points}")
-        turn, shift = (
-            1000 * np.sqrt(np.linalg.eigvalsh(found.covariance[k, k])[-1]) for k in (_TURN, _SHIFT)
-        )
+        turn, shift = (1000 * np.sqrt(np.linalg.eigvalsh(found.covariance[k])[-1]) for k in (_TURN, _SHIFT))
         print(f"uncertain by {turn:.2f} mrad and {shift:.1f} mm (worst axes)")
     save_rig(asked.out, _with_lidar(rig, camera, found.T_cam_lidar, _points_record(found)))
     if not asked.quiet:
@@ -69,7 +67,12 @@ def run_scene(asked: Asked, camera: str, images: str, clouds: str, together: Tog
     """The LiDAR's place refined on the scene: the rig must say where it roughly is."""
     refuse_existing(asked.out, asked.overwrite)
     rig = read_rig(asked.rig) if asked.rig is not None else Rig()
-    lens, start = rig.camera(camera), rig.pose(camera, "lidar")
+    lens = rig.camera(camera)
+    try:
+        start = rig.pose(camera, "lidar")
+    except UsageError as error:
+        hint = f"add T_{camera}_lidar, nearly right, for the scene to refine; or give --board, or --points"
+        raise UsageError(error.what, where=asked.rig or "", hint=hint) from None
     with (
         quiet_libraries(),
         closing(open_source(images, "fir" if camera == "fir" else "rgb", fir_colour="luma")) as source,

@@ -20,6 +20,8 @@ BLEND_EXAMPLES = """Examples:
   fusion blend rgb/ fir/ -o out/ --preview
   fusion blend rgb/ fir/ --dry-run
   fusion blend rgb/ fir/ -o out/ --points points.csv --outside crop
+  fusion blend rgb/ fir/ -o out/ --align
+  fusion blend rgb/ fir/ -o out/ --rig rig.toml --depth depth/
   fusion blend rgb/ fir/ -o out/ --window 7000 7400 --window-unit counts --colormap inferno
   fusion blend 'day/*_eo-*.jpg' 'day/*_thermal-*.tiff' -o out/ --pair index
   fusion blend rgb.mp4 fir.mkv -o out/ --tolerance-ms 20 --format jpg

@@ -24,6 +24,7 @@ class PairingRule:
     of their groups, or the whole match where they have none. Without them the key is the stem (`stem`),
     the last number in it (`index`) or the time stamp in it (`stamp`, where the source has no clock).
     `tolerance_ns` belongs to `stamp`; None takes half the median interval of the denser stream.
+    `fir_offset_ns` is added to thermal stamps to give RGB's clock, as a rig says it.
     `map_file` is a CSV with the header ``rgb,fir`` or a JSON object of RGB name to thermal name.
     `auto`: the map if one is given; time if both sides have a clock or a tolerance is given; order if
     there is one image each; else stem.
@@ -34,6 +35,7 @@ class PairingRule:
     fir_key: str | None = None
     tolerance_ns: int | None = None
     map_file: str | None = None
+    fir_offset_ns: int = 0
 
     def __post_init__(self) -> None:
         if self.by not in _RULES:

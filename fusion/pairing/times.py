@@ -61,6 +61,7 @@ def _read_stamp(text: str) -> int | None:
 def by_stamp(rgb: Sequence[Entry], fir: Sequence[Entry], rule: PairingRule) -> Match:
     match = Match()
     a, b = _timeline(rgb, rule.rgb_key, match.rgb, "RGB"), _timeline(fir, rule.fir_key, match.fir, "thermal")
+    b = [(t + rule.fir_offset_ns, j) for t, j in b]
     times = [t for t, _ in a], [t for t, _ in b]
     limit = _default_tolerance(*times) if rule.tolerance_ns is None else rule.tolerance_ns
     match.tolerance_ns = limit

@@ -162,7 +162,7 @@ def test_more_codes_than_there_are() -> None:
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="none[.]toml"):
+    with pytest.raises(UsageError, match=r"none[.]toml"):
         load_board(tmp_path / "none.toml")
     with pytest.raises(FusionError):
         load_board(tmp_path)

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from calib.boards import Board
 from calib.links import find_link, join_views, mirrored_camera, reflection
 from calib.observations import View
+from calib.scenes import MODELS, T_RGB_FIR, scene
 from fusion.errors import InputError
 from fusion.geometry import FisheyeCamera, Floats, PinholeCamera, invert, pose, transform
-from tests.calib.scenes import MODELS, T_RGB_FIR, scene
 
 BOARD = Board.of("chessboard", 9, 6, 0.08)
 SESSION = scene(7, 12, lidar=False)

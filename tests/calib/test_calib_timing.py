@@ -13,11 +13,11 @@ from calib.boards import Board
 from calib.moments import Shot, pair
 from calib.observations import Detection, Refusal
 from calib.rigging import calibrate_rig
+from calib.scenes import MODELS, T_RGB_FIR
 from calib.solve import exp_motion
-from calib.timing import Track, estimate_offset, motion_of
+from calib.timing import Track, estimate_offset, motion_of, speeds
 from fusion.errors import InputError, UsageError
 from fusion.geometry import Floats, invert, pose, transform
-from tests.calib.scenes import MODELS, T_RGB_FIR
 
 BOARD = Board.of("chessboard", 5, 4, 0.12)
 CAMERAS = {"rgb": MODELS["pinhole5"], "fir": MODELS["thermal5"]}
@@ -165,3 +165,14 @@ def test_a_steady_motion_is_its_twist():
     there = way(times[14] + ahead)
     missed = [np.abs(way(times[14]) @ exp_motion(ahead * x[0]) - there).max() for x in (slope, chord)]
     assert missed[1] < 0.2 * missed[0]
+
+
+def test_speeds_are_those_of_the_boards_middle_in_any_frame():
+    """Against finite differences of where the middle is, seen from another sensor."""
+    way, seen = hand(2), track(hand(2), 30, 2, 0.0, T_RGB_FIR)
+    twist, _ = motion_of(seen, seen.time_s[25:26])
+    t, middle = seen.time_s[25], BOARD.points_m.mean(0, keepdims=True)
+    step = transform(way(t + 1e-4), middle) - transform(way(t - 1e-4), middle)
+    turn = Rotation.from_matrix(way(t - 1e-4)[:3, :3].T @ way(t + 1e-4)[:3, :3]).magnitude()
+    expected = np.array([turn, np.linalg.norm(step)]) / 2e-4
+    np.testing.assert_allclose(speeds(BOARD, twist)[0], expected, rtol=0.01)

@@ -12,6 +12,8 @@ from board_pictures import glow, shoot, without_board
 
 from calib.boards import Board
 from calib.detect.circles import find_circles
+from calib.detect.dots import place
+from calib.detect.known import Known, mapped
 from calib.observations import Detection, Refusal
 
 ASYMMETRIC = Board.of("asymmetric-circles", 4, 11, 0.02)
@@ -100,14 +102,72 @@ def test_hidden_circles_are_not_reported_and_settle_the_labels() -> None:
     assert np.hypot(*(result.uv - shot.uv[result.ids]).T).max() < 0.2
 
 
-def test_another_board_is_refused() -> None:
-    shot = shoot(Board.of("circles", 9, 7, 0.03))
+@pytest.mark.parametrize(("cols", "rows"), [(9, 7), (8, 5), (7, 4), (6, 6)])
+def test_another_board_is_refused(cols: int, rows: int) -> None:
+    shot = shoot(Board.of("circles", cols, rows, 0.03), fill=0.45)
     assert isinstance(find_circles(shot.counts(60, 120), SYMMETRIC), Refusal)
+
+
+def test_a_larger_board_that_only_one_place_fits_is_refused() -> None:
+    """With a part hidden it lies on a full one in one way only; but there are circles beside it."""
+    larger = Board.of("asymmetric-circles", 5, 11, 0.02)
+    smaller = Board.of("asymmetric-circles", 4, 11, 0.02, hidden=[[0, 0, 1, 1]])
+    picture = shoot(larger, fill=0.4).counts(60, 120)
+    assert isinstance(find_circles(picture, smaller), Refusal)
+
+
+def test_circles_of_both_polarities_are_no_grid() -> None:
+    """Every other circle is brighter than the plate, as no board is."""
+    shot = shoot(SYMMETRIC, tilt=(0.0, 0.1))
+    picture = np.full(shot.bright.shape, 120, np.uint8)
+    for k, (x, y) in enumerate(shot.uv):
+        cv2.circle(picture, (round(x), round(y)), 12, 60 if k % 2 else 180, -1, cv2.LINE_AA)
+    result = find_circles(picture, SYMMETRIC)
+    assert isinstance(result, Refusal), result
+
+
+def test_circles_of_the_other_polarity_are_left_out() -> None:
+    shot = shoot(SYMMETRIC, tilt=(0.0, 0.1), fill=0.6)
+    picture = shot.counts(60, 120)
+    for k in (16, 18):
+        x, y = (round(v) for v in shot.uv[k])
+        part = picture[y - 14 : y + 15, x - 14 : x + 15]
+        part[part < 178] = 255 - (part[part < 178] // 2)
+    result = found(picture, SYMMETRIC)
+    assert set(result.ids) == set(range(35)) - {16, 18}
+
+
+@pytest.mark.parametrize("lost", [0, 6])
+def test_the_frames_edge_says_which_column_is_missing(lost: int) -> None:
+    """Of 7 columns 6 are there; the one that lies outside the picture is no miss, the one inside would be."""
+    uv = SYMMETRIC.points_m[:, :2] / 0.03 * 40 + (60, 40)
+    uv[:, 0] -= 80 if lost == 0 else 0
+    there = np.arange(35) % 7 != lost
+    size = (320, 240) if lost == 0 else (290, 240)
+    first = place((uv[there] // 40).astype(np.intp), uv[there], SYMMETRIC, size, 10.0)[0]
+    assert (first.hits, first.misses) == (30, 0)
+    true = np.flatnonzero(there)
+    assert any(np.array_equal(turn[true], first.ids) for turn in SYMMETRIC.symmetries())
+
+
+def test_known_places_predict_through_a_lens() -> None:
+    """A homography alone is off by pixels where the lens bends the picture."""
+    xy = ASYMMETRIC.points_m[:, :2]
+    centred = (xy - xy.mean(0)) / 0.1
+    uv = 300 * centred * (1 - 0.12 * (centred**2).sum(1, keepdims=True)) + (320, 240)
+    inner = np.abs(centred).max(1) < 0.9
+    known = Known.of(xy, uv, robust=False)
+    assert known is not None
+    ours, _ = known.predict(xy, without_itself=True)
+    plain = np.hypot(*(mapped(known.H, xy) - uv).T)[inner]
+    assert np.hypot(*(ours - uv).T)[inner].mean() < 0.6 * plain.mean()
+    on_a_line = Known.of(xy[:4], uv[:4], robust=False)
+    assert on_a_line is None
 
 
 @pytest.mark.parametrize("board", [ASYMMETRIC, SYMMETRIC], ids=str)
 def test_no_board_where_there_is_none(board: Board) -> None:
-    for seed in range(6):
+    for seed in (0, 1, 2, 3, 4, 5, 10):
         assert isinstance(find_circles(without_board(seed), board), Refusal), seed
 
 

@@ -113,6 +113,25 @@ def test_another_dictionary_or_size_is_refused() -> None:
     assert isinstance(find_coded(picture, wider), Refusal)
 
 
+def test_codes_that_contradict_the_board_are_no_board() -> None:
+    """The lower row's tags are where the board has them, those of the upper rows stand one column further."""
+    shot = shoot(APRIL, tilt=(0.0, 0.0), turn=0.0, fill=0.75)
+    picture = shot.counts(60, 120)
+    corner = shot.uv.reshape(6, 10, 2)
+    blocks = {}
+    for row, col in np.ndindex(2, 5):
+        x, y = np.round(corner[2 * row, 2 * col]).astype(int)
+        blocks[row, col] = (slice(y - 3, y + 62), slice(x - 3, x + 62))
+    side = corner[0, 1, 0] - corner[0, 0, 0]
+    assert 52 < side < 60
+    tags = {key: picture[block].copy() for key, block in blocks.items()}
+    for (row, col), block in blocks.items():
+        picture[block] = tags[row, (col + 1) % 5]
+    result = find_coded(picture, APRIL)
+    assert isinstance(result, Refusal)
+    assert "where the board has them" in result.reason
+
+
 @BOARDS
 def test_no_board_where_there_is_none(board: Board) -> None:
     for seed in range(6):

@@ -97,10 +97,10 @@ def test_second_run_reads_only_what_was_not_done(folder: Folder, tmp_path: Path)
 
     with DetectionCache(path, BOARD) as cache, pytest.raises(Killed):
         find_in_images(folder.refs()[:2] + folder.refs()[2:], BOARD, cache=cache, progress=stop)
-    done = len(path.read_text().splitlines())
-    assert 2 <= done <= 4
-    with path.open("a") as file:
-        file.write('{"sum": 12, "li')  # killed while it wrote
+    lines = path.read_text().splitlines()
+    assert len(lines) >= 2
+    path.write_text(lines[0] + "\n" + lines[1] + "\n" + lines[0][:50])  # killed while it wrote
+    done = 2
     folder.read.clear()
     with DetectionCache(path, BOARD) as cache:
         found = find_in_images(folder.refs(), BOARD, cache=cache)
@@ -145,7 +145,7 @@ def test_lines_that_lie_are_counted_and_left_out(folder: Folder, tmp_path: Path)
 
     uv = json.loads(line)["uv"]
     bad = [
-        good.replace("uv", "vu", 1),
+        good.replace(f"{uv[0][0]}", f"{uv[0][0] + 1}", 1),  # the check sum alone tells
         forged(ids=[0, 0, 1, 2], uv=uv[:4]),
         forged(ids=[0, 1, 2, 99], uv=uv[:4]),
         forged(ids=[0, 1, 2, -1], uv=uv[:4]),

@@ -201,7 +201,7 @@ def test_a_lidar_that_looks_elsewhere_is_found_without_a_guess(scans: tuple[dict
     """The LiDAR's own axes turned by 40 degrees: the convention does not lead to the board."""
     T_cam_board, clouds, rings = scans
     turned = pose(Rotation.from_rotvec([0, 0, 0.7]).as_matrix())
-    some = sorted(clouds)[:5]
+    some = sorted(clouds)[::2]
     moved = {m: transform(turned, clouds[m]) for m in some}
     found = lidar_start(board(), {m: T_cam_board[m] for m in some}, moved, rings=rings)
     expected = T_CAM_TRUE @ invert(turned)

@@ -87,6 +87,31 @@ def test_the_covariance_is_what_repetition_shows() -> None:
     assert (np.abs(np.log(seen / said)) < 0.6).all()  # 24 runs: +-15 % each, one sigma
 
 
+def test_the_covariance_of_the_shift_is_that_of_opencvs_derivatives() -> None:
+    xyz, uv = pairs(PINHOLE, 9, 0.5)
+    found = from_points(PINHOLE, xyz, uv)
+    T = found.T_cam_lidar
+    r, distortion = cv2.Rodrigues(T[:3, :3])[0], np.array(PINHOLE.distortion)
+    _, J = cv2.projectPoints(xyz, r, T[:3, 3], PINHOLE.matrix(), distortion)[:2]
+    sigma2 = (found.error_px**2).sum() / (2 * 9 - 6)
+    theirs = sigma2 * np.linalg.inv(J[:, :6].T @ J[:, :6])
+    np.testing.assert_allclose(found.covariance[3:, 3:], theirs[3:, 3:], rtol=1e-3)
+
+
+def test_a_fisheye_that_sees_the_points_far_off_its_axis_only() -> None:
+    rng = np.random.default_rng(6)
+    angle, around = rng.uniform(1.1, 1.7, 24), rng.uniform(-0.6, 0.6, 24)
+    axis = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], 1)
+    xyz = axis * rng.uniform(2, 8, (24, 1))
+    uv, seen = FISHEYE.project(xyz)
+    assert seen.all()
+    uv[::3] += rng.uniform(40, 80, (8, 2))
+    away = np.array([30.0, -20.0, 10.0])  # points of a map: its origin is far off, which a wrong pose shows
+    found = from_points(FISHEYE, transform(invert(TRUE), xyz) + away, uv)
+    np.testing.assert_allclose(found.T_cam_lidar, TRUE @ pose(translation_m=-away), atol=1e-4)
+    assert set(np.flatnonzero(~found.inliers)) == set(range(0, 24, 3))
+
+
 def test_pairs_that_fix_no_pose_are_refused_in_words() -> None:
     xyz, uv = pairs(PINHOLE, 12)
     line = np.linspace(0, 1, 12)[:, None] * [0.5, 1, 0.2] + [4, -0.5, 0]

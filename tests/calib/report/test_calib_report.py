@@ -23,11 +23,11 @@ from calib.report.pictures import (
 )
 from calib.report.record import known_covariance, rig_of, views_behind
 from calib.report.text import closing_lines
+from calib.scenes import Scene, scene
 from calib.solve import Solution, solve
 from fusion.codecs import decode_image
 from fusion.geometry import pose
 from fusion.rig import Rig, load_rig, save_rig
-from tests.calib.scenes import Scene, scene
 
 
 @pytest.fixture(scope="module")

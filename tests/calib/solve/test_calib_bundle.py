@@ -13,13 +13,13 @@ import pytest
 from scipy.optimize import least_squares
 
 from calib.observations import View
+from calib.scenes import Scene, errors, perturbed, planted, scene
 from calib.solve import Solution, solve
 from calib.solve.blocks import blocks_of
 from calib.solve.cameras import parameters
 from calib.solve.state import Layout
 from fusion.errors import InputError
 from fusion.geometry import PinholeCamera, transform
-from tests.calib.scenes import Scene, errors, perturbed, planted, scene
 
 
 @lru_cache(maxsize=8)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.scenes import chi_square, coverage, perturbed, scene
 from calib.solve import solve
 from calib.solve.blocks import blocks_of
 from calib.solve.state import Layout
-from tests.calib.scenes import chi_square, coverage, perturbed, scene
 
 
 def test_the_truth_lies_in_the_ellipsoid_as_often_as_it_says() -> None:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from calib.scenes import MODELS, scene
 from calib.solve.blocks import blocks_of
 from calib.solve.cameras import parameter_names, parameters, project, with_parameters
 from calib.solve.motion import cross, exp_motion, hat, moved
 from calib.solve.normal import assemble, part_of
 from calib.solve.state import Layout
 from fusion.geometry import FisheyeCamera
-from tests.calib.scenes import MODELS, scene
 
 POINTS = np.random.default_rng(0).normal((0, 0, 1), 0.25, (40, 3))
 EQUIDISTANT = FisheyeCamera((640, 480), 330.0, 331.0, 322.9, 234.3)

@@ -131,7 +131,8 @@ def _view(
 
 
 def _cloud(rng: np.random.Generator, board: Board, truth: Estimate, moment: str, noise_m: float) -> CloudView:
-    assert board.plate_m is not None
+    if board.plate_m is None:
+        raise ValueError("expected a board with a plate")
     left, top, right, bottom = board.plate_m
     T = invert(truth.T_ref_sensor["lidar"]) @ _pose_at(truth, moment, "lidar", 0.0)
     on_plate = np.stack([rng.uniform(left, right, 200), rng.uniform(top, bottom, 200), np.zeros(200)], -1)
