@@ -28,8 +28,7 @@ TEXT = """\
 Error in RGB pixels, median over the pairs, and how many pairs lie under {within} px; seconds of one thread
 a pair (median). *Warps*: {warps} MSRS and RoadScene pairs whose thermal image was bent by a known dense flow
 with an elastic part that no affine map holds; mean over the pixels whose truth lies inside. *Landmarks*:
-{landmarks} unaligned pairs with a map from landmarks; mean over the corners. Wanted: {wanted}. The thermal
-images of MSRS are aligned to some pixels only, which no method can undo."""
+{landmarks} unaligned pairs with a map from landmarks; mean over the corners. Wanted: {wanted}."""
 
 
 @dataclass(frozen=True, slots=True)

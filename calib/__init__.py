@@ -1,1 +1,2 @@
-"""Calibration of RGB + thermal + LiDAR rigs. Nothing is built here yet; see docs/architecture.md."""
+"""Calibration of RGB + thermal + LiDAR rigs: from boards, or from the scene, to a `fusion.rig.Rig` with its
+evidence."""

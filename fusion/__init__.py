@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from fusion.pairing import PairingRule
     from fusion.pipeline import Fuser
     from fusion.provenance import describe_run
-    from fusion.rig import Rig, load_rig
+    from fusion.rig import Rig, load_rig, save_rig
+    from fusion.rig_warp import DepthWarp, RigWarp, parallax_px
     from fusion.sinks.folder import FolderSink
     from fusion.sync import open_pairs
     from fusion.thermal import WindowRule
@@ -35,6 +36,7 @@ __all__ = [
     "BlendConfig",
     "DepthConfig",
     "DepthLane",
+    "DepthWarp",
     "FolderSink",
     "FrameError",
     "FrameSet",
@@ -47,6 +49,7 @@ __all__ = [
     "PairingRule",
     "PointCloud",
     "Rig",
+    "RigWarp",
     "UsageError",
     "Warp",
     "Window",
@@ -55,8 +58,10 @@ __all__ = [
     "describe_run",
     "load_rig",
     "open_pairs",
+    "parallax_px",
     "read_cloud",
     "run",
+    "save_rig",
 ]
 
 _HOMES = {
@@ -71,7 +76,8 @@ _HOMES = {
     "pairing": ("PairingRule",),
     "pipeline": ("Fuser",),
     "provenance": ("describe_run",),
-    "rig": ("Rig", "load_rig"),
+    "rig": ("Rig", "load_rig", "save_rig"),
+    "rig_warp": ("DepthWarp", "RigWarp", "parallax_px"),
     "sinks.folder": ("FolderSink",),
     "sync": ("open_pairs",),
     "thermal": ("WindowRule",),
