@@ -44,7 +44,7 @@ def solve(
     1979). With `robust`, a Cauchy loss finds the way; then points farther out than five standard deviations
     (by the median) are left out and the rest is plain least squares, so that the covariance is that of
     normal noise. With `drop_views`, views most of whose points do not fit go too, and those whose median
-    error is far above the others' (2.5 times, six deviations of the medians, and 0.1 px). Distortion coefficients
+    error is far above the others' (2.5 times, six deviations of the medians, 0.1 px). Distortion coefficients
     have a prior that speaks only where the data do not: each moves the radius in the picture's corner by
     100 % (one standard deviation). `progress(step, most)` is called after each step.
 
