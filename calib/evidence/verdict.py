@@ -87,7 +87,7 @@ def gather(
     }
     judged = held_out(board, solution, fixed=fixed, progress=progress)
     found = {name: view for name in cameras if (view := next_view(board, solution, name)) is not None}
-    verdict = judge(solution, covered, transfer, judged, found)
+    verdict = judge(solution, covered, transfer, judged, found, projection)
     return Evidence(covered, projection, transfer, judged, found, verdict, closure)
 
 
@@ -97,6 +97,7 @@ def judge(
     transfer: Mapping[tuple[str, str], Mapping[float, UncertaintyMap]],
     judged: HeldOut,
     next_views: Mapping[str, NextView],
+    projection: Mapping[str, UncertaintyMap] | None = None,
 ) -> Verdict:
     """The verdict: by what may land how far off, and by what the residuals say of the model."""
     good: list[str] = []
@@ -109,6 +110,11 @@ def judge(
         if camera in next_views and next_views[camera].then_px < 0.9 * next_views[camera].now_px:
             view = next_views[camera]
             record.append(f"{camera}: {view.words} ({view.now_px:.2f} px would become {view.then_px:.2f})")
+    for camera, found in (projection or {}).items():
+        if found.worst_px > USABLE_PX:
+            bad.append(
+                f"the rim of {camera}'s image, where no point was seen: up to {found.worst_px:.1f} px off"
+            )
     grades.extend(_pair_grade(dst, src, maps, good, bad) for (dst, src), maps in transfer.items())
     worst = max((GRADES.index(grade) for grade in grades), default=len(GRADES) - 1)
     return Verdict(GRADES[worst], tuple(good), tuple(bad), tuple(record))

@@ -191,6 +191,17 @@ def test_verdict_is_good_for_a_good_rig_and_not_for_a_bad_one(
     assert any("laying fir on rgb" in line for line in bad.not_for)
 
 
+def test_verdict_warns_of_the_rim(usual: tuple[Scene, Solution], evidence: Evidence) -> None:
+    found = evidence.projection["rgb"]
+    sure, unsure = (replace(found, sigma_px=scale * found.sigma_px / found.worst_px) for scale in (2.9, 3.1))
+    said = [
+        judge(usual[1], evidence.coverage, {}, evidence.held_out, {}, {"rgb": one}).not_for
+        for one in (sure, unsure)
+    ]
+    assert not any("rim of rgb" in line for line in said[0])
+    assert any("rim of rgb" in line and "3.1 px" in line for line in said[1])
+
+
 def test_verdict_says_when_the_model_does_not_fit(usual: tuple[Scene, Solution], evidence: Evidence) -> None:
     _, solution = usual
     rough = replace(solution, residual_px=tuple(40 * r for r in solution.residual_px))
