@@ -24,6 +24,7 @@ import memory
 import mine
 import warp
 from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
+from page import OPENING, renewed
 from processes import Processes
 from table import Section, summary
 from workspace import Workspace, machine_lines, storage, version_lines, workspace
@@ -72,12 +73,16 @@ def main() -> None:
         "--quick", action="store_true", help="a smoke run: few rounds, few frames, soft figures"
     )
     parser.add_argument(
-        "--only", action="append", choices=list(SECTIONS), help="only these sections (never with --write)"
+        "--only", action="append", choices=list(SECTIONS), help="only these sections; --write renews them"
     )
     options = parser.parse_args()
     if options.only and options.write:
-        parser.error("--only makes no whole page: leave --write out")
-    page = measure(QUICK if options.quick else Plan(), options.only or list(SECTIONS), quick=options.quick)
+        parts = measured(Plan(), options.only)
+        page = renewed(options.write.read_text(encoding="utf-8"), parts.sections)
+    else:
+        page = measure(
+            QUICK if options.quick else Plan(), options.only or list(SECTIONS), quick=options.quick
+        )
     print(page)
     if options.write:
         options.write.write_text(page, encoding="utf-8")
@@ -86,13 +91,18 @@ def main() -> None:
 def measure(plan: Plan, names: list[str], *, quick: bool) -> str:
     """The whole page."""
     began, machine = time.monotonic(), machine_lines()
+    parts = measured(plan, names)
+    minutes = (time.monotonic() - began) / 60
+    return page_of(plan, parts, machine, minutes, quick)
+
+
+def measured(plan: Plan, names: list[str]) -> Parts:
     parts = Parts([], [])
     with workspace() as space:
         for name in names:
             print(f"measuring: {name} …", file=sys.stderr, flush=True)
             SECTIONS[name](plan, space, parts)
-    minutes = (time.monotonic() - began) / 60
-    return page_of(plan, parts, machine, minutes, quick)
+    return parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +140,7 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
 def page_of(plan: Plan, parts: Parts, machine: list[str], minutes: float, quick: bool) -> str:
     blocks = [
         "# Benchmarks",
-        "Written by `make bench`, which replaces it. The targets were set before anything was measured.",
+        OPENING,
         *(["**A smoke run (`--quick`): these figures are soft.**"] if quick else []),
         summary(parts.sections),
         *(section.markdown() for section in parts.sections),
