@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,6 @@ _INK, _PAPER = (235, 235, 235), (30, 30, 30)
 _GREEN, _RED, _YELLOW = (80, 220, 80), (80, 80, 255), (60, 220, 255)
 
 
-_LETTERING = threading.Lock()  # OpenCV's fonts share glyphs: two threads at once may draw other pixels
-
-
 def debug_picture(
     image: NDArray[Any], result: Detection | Refusal, trace: Trace, title: str, board: Board | None = None
 ) -> Picture:
@@ -31,12 +27,11 @@ def debug_picture(
 
     With `board` the points are joined along its rows. Nothing given is changed.
     """
-    with _LETTERING:
-        tiles = [_tile(step, pixels, points) for step, pixels, points in trace.steps]
-        tiles.append(_verdict(image, result, board))
-        columns = min(len(tiles), 3)
-        rows = [_row(tiles[k : k + columns], columns) for k in range(0, len(tiles), columns)]
-        return np.vstack([_line(title, columns * _TILE_WH[0], _INK), *rows])
+    tiles = [_tile(step, pixels, points) for step, pixels, points in trace.steps]
+    tiles.append(_verdict(image, result, board))
+    columns = min(len(tiles), 3)
+    rows = [_row(tiles[k : k + columns], columns) for k in range(0, len(tiles), columns)]
+    return np.vstack([_line(title, columns * _TILE_WH[0], _INK), *rows])
 
 
 def _row(tiles: list[Picture], columns: int) -> Picture:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +12,7 @@ from fusion.lidar.sparse import SparseDepth
 NONE_GREY, PAPER, INK = 96, 255, (32, 32, 32)
 BAR_WIDTH, BAR_GAP, LABEL_WIDTH = 18, 10, 76
 FONT_PX, LEAST_HEIGHT = 14, 120
-_LETTERING = threading.Lock()  # OpenCV's fonts share glyphs: two threads at once may draw other pixels
+REGULAR = 400  # said, for OpenCV draws on in the weight that this thread drew in last
 
 
 def coloured(value_m: NDArray[np.float32], colormap: str, show_m: tuple[float, float]) -> NDArray[np.uint8]:
@@ -68,8 +66,7 @@ def _scale(height: int, colormap: str, show_m: tuple[float, float]) -> NDArray[n
         row = round(margin + (hi - tick) / (hi - lo) * len(rows) - 0.5)
         cv2.line(strip, (BAR_GAP + BAR_WIDTH, row), (BAR_GAP + BAR_WIDTH + 3, row), INK)
         at = (BAR_GAP + BAR_WIDTH + 6, row + FONT_PX // 2 - 2)
-        with _LETTERING:
-            cv2.putText(strip, f"{tick:g} m", at, INK, cv2.FontFace("sans"), FONT_PX)
+        cv2.putText(strip, f"{tick:g} m", at, INK, cv2.FontFace("sans"), FONT_PX, weight=REGULAR)
     return strip
 
 

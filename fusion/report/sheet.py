@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fusion.errors import FrameError, InputError
 from fusion.kernels import index_counts
 from fusion.pipeline import Fuser, Stages
+from fusion.report.depth_picture import REGULAR
 
 PANEL_WIDTH, CAPTION_HEIGHT, GAP = 320, 26, 4
 TITLES = ("RGB", "thermal, full range", "thermal on RGB", "window and colour", "fused")
@@ -80,5 +81,5 @@ def _padded(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
 def _captions(texts: Sequence[str], width: int = PANEL_WIDTH + GAP) -> NDArray[np.uint8]:
     strip = np.full((CAPTION_HEIGHT, width * len(texts), 3), PAPER, np.uint8)
     for column, text in enumerate(texts):
-        cv2.putText(strip, text, (column * width + 4, 18), INK, cv2.FontFace("sans"), 14)
+        cv2.putText(strip, text, (column * width + 4, 18), INK, cv2.FontFace("sans"), 14, weight=REGULAR)
     return strip
