@@ -181,6 +181,8 @@ def _with_view(board: Board, solution: Solution, camera: str, T_camera_board: Fl
         used=(everything,),
         residual_px=(np.zeros((len(ids), 2)),),
         clouds=(),
+        plane_used=(),
+        edge_used=(),
     )
 
 

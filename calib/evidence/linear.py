@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from calib.boards import Board
+from calib.lidar.start import edge_distances
 from calib.observations import CloudView, View
 from calib.solve.cameras import parameter_names, parameters, with_parameters
 from calib.solve.estimate import Estimate, Solution
@@ -79,10 +80,11 @@ def seen_px(board: Board, view: View, estimate: Estimate) -> Floats:
     return estimate.cameras[view.camera].project(transform(T, board.points_m[view.ids]))[0]
 
 
-def plane_m(cloud: CloudView, estimate: Estimate) -> Floats:
-    """The distances of a cloud's points from the board's plane, N."""
+def off_board_m(board: Board, cloud: CloudView, estimate: Estimate) -> tuple[Floats, Floats]:
+    """The distances of a cloud's points from the board's plane, and of its rim's from the plate's sides."""
     T_board_sensor = invert(board_pose(estimate, cloud.moment, cloud.sensor))
-    return transform(T_board_sensor, cloud.plane_m)[:, 2]
+    rim = edge_distances(transform(T_board_sensor, cloud.edge_m), cloud.edge_of, board)
+    return transform(T_board_sensor, cloud.plane_m)[:, 2], rim
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +108,15 @@ def moments_of(board: Board, solution: Solution) -> list[Moment]:
     seen: dict[str, list[Callable[[Estimate], Floats]]] = {}
     for view, used in zip(solution.views, solution.used, strict=True):
         seen.setdefault(view.moment, []).append(_weighted_view(board, view, used, solution))
-    for cloud in solution.clouds:
-        seen.setdefault(cloud.moment, []).append(_weighted_cloud(cloud, solution))
+    clouds = zip(solution.clouds, solution.plane_used, solution.edge_used, strict=True)
+    for cloud, plane_used, edge_used in clouds:
+        counted = replace(
+            cloud,
+            plane_m=cloud.plane_m[plane_used],
+            edge_m=cloud.edge_m[edge_used],
+            edge_of=cloud.edge_of[edge_used],
+        )
+        seen.setdefault(cloud.moment, []).append(_weighted_cloud(board, counted, solution))
     return [_linearised(name, parts, estimate, solution) for name, parts in seen.items()]
 
 
@@ -137,9 +146,15 @@ def _weighted_view(
     return lambda estimate: seen_px(board, kept, estimate) / sigma
 
 
-def _weighted_cloud(cloud: CloudView, solution: Solution) -> Callable[[Estimate], Floats]:
-    sigma = solution.sigma_m or 1.0
-    return lambda estimate: plane_m(cloud, estimate) / sigma
+def _weighted_cloud(board: Board, cloud: CloudView, solution: Solution) -> Callable[[Estimate], Floats]:
+    sigmas = solution.sigma_m or 1.0, solution.sigma_edge_m or 1.0
+
+    def seen(estimate: Estimate) -> Floats:
+        return np.concatenate(
+            [off / sigma for off, sigma in zip(off_board_m(board, cloud, estimate), sigmas, strict=True)]
+        )
+
+    return seen
 
 
 def with_held(

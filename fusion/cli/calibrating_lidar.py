@@ -69,7 +69,8 @@ def _by_board(
     with Desk(asked) as desk:
         for camera, spec in specs.items():
             desk.look(camera, spec)
-        pairing = pair({**desk.shots, LIDAR: _cloud_shots(files)}, **options)
+        streams = {**desk.shots, LIDAR: _cloud_shots(files)}
+        pairing = pair(streams, **options, offset_s=rig.time_offset_s)
         if not asked.quiet:
             print(pairing.table())
         warn(pairing.notes)
@@ -148,20 +149,16 @@ def _with_lidar(
         clouds.rings,
         files=clouds.files,
     )
-    warn(start.notes)
     poses = {**estimate.T_ref_sensor, LIDAR: start.T_ref_lidar}
     joint = solve(
         desk.board, solution.views, start.views, start=replace(estimate, T_ref_sensor=poses), fixed=fixed
     )
-    warn(
-        [note]
-        if (note := spacing_note(*board_scale(estimate.T_ref_board, start.T_ref_lidar, start.views)))
-        else []
-    )
+    spacing = spacing_note(*board_scale(estimate.T_ref_board, start.T_ref_lidar, start.views))
+    notes = (*start.notes, *([spacing] if spacing else []), *joint.notes)
     lost = [(Path(clouds.files[moment]).name, why) for moment, why in start.dropped]
     apart = "the board's pose in the cameras is not known"
     lost += [(Path(clouds.files[moment]).name, apart) for moment in clouds.xyz_m.keys() - usable.keys()]
-    return replace(joint, dropped_views=(*solution.dropped_views, *lost, *joint.dropped_views))
+    return replace(joint, notes=notes, dropped_views=(*solution.dropped_views, *lost, *joint.dropped_views))
 
 
 def _closure(desk: Desk, solution: Solution, clouds: Clouds) -> tuple[float, float] | None:

@@ -98,6 +98,17 @@ def test_information_of_the_moments_is_the_solvers_covariance(usual: tuple[Scene
     assert np.sqrt(np.diag(ours)) == pytest.approx(np.sqrt(np.diag(theirs)), rel=0.05)
 
 
+def test_the_lidar_counts_with_its_plane_and_its_rim() -> None:
+    """As above, with clouds; a point that the solver left out counts in neither."""
+    made = scene(1, VIEWS)
+    spoilt = replace(made.clouds[0], plane_m=made.clouds[0].plane_m + np.eye(200, 1) * 0.5)
+    solution = solve(made.board, made.views, [spoilt, *made.clouds[1:]], start=made.truth)
+    assert not solution.plane_used[0].all()
+    information = np.sum([m.information() for m in moments_of(made.board, solution)], 0)
+    ours, theirs = np.linalg.inv(information), solution.covariance
+    assert np.sqrt(np.diag(ours)) == pytest.approx(np.sqrt(np.diag(theirs)), rel=0.05)
+
+
 def test_uncertainty_grows_where_no_point_was_seen(usual: tuple[Scene, Solution]) -> None:
     made, solution = usual
     found = projection_uncertainty(made.board, solution, "rgb", 1.5)
