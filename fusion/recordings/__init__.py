@@ -1,0 +1,1 @@
+"""Recordings: rosbag1, rosbag2, MCAP."""
