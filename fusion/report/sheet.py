@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.errors import FrameError, InputError
+from fusion.fusing import Stages
 from fusion.kernels import index_counts
-from fusion.pipeline import Fuser, Stages
+from fusion.pipeline import Fuser
 from fusion.report.depth_picture import REGULAR
 
 PANEL_WIDTH, CAPTION_HEIGHT, GAP = 320, 26, 4
