@@ -41,39 +41,6 @@ class Image:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameSet:
-    """What the sensors saw at one moment: an RGB image and a thermal image, on their own grids."""
-
-    rgb: Image
-    fir: Image
-
-    def __post_init__(self) -> None:
-        if self.rgb.pixels.ndim != 3:
-            raise ValueError(f"rgb must be HxWx3 BGR, got {self.rgb.pixels.shape}")
-        if self.fir.pixels.ndim != 2:
-            raise ValueError(f"fir must be HxW counts, got {self.fir.pixels.shape}")
-
-    @property
-    def bgr(self) -> NDArray[np.uint8]:
-        return np.asarray(self.rgb.pixels, np.uint8)  # no copy: what they are
-
-    @property
-    def counts(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        return self.fir.pixels
-
-    @property
-    def stem(self) -> str:
-        return self.rgb.stem
-
-    @property
-    def dt_ns(self) -> int | None:
-        """Thermal stamp minus RGB stamp; None where either has no clock."""
-        if self.rgb.stamp_ns is None or self.fir.stamp_ns is None:
-            return None
-        return self.fir.stamp_ns - self.rgb.stamp_ns
-
-
-@dataclass(frozen=True, slots=True)
 class PointCloud:
     """Points of one scan or of one map, in the LiDAR's frame: x forward, y left, z up.
 
@@ -101,6 +68,40 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.xyz_m)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSet:
+    """What the sensors saw at one moment: RGB and thermal images on their own grids, and perhaps a scan."""
+
+    rgb: Image
+    fir: Image
+    cloud: PointCloud | None = None
+
+    def __post_init__(self) -> None:
+        if self.rgb.pixels.ndim != 3:
+            raise ValueError(f"rgb must be HxWx3 BGR, got {self.rgb.pixels.shape}")
+        if self.fir.pixels.ndim != 2:
+            raise ValueError(f"fir must be HxW counts, got {self.fir.pixels.shape}")
+
+    @property
+    def bgr(self) -> NDArray[np.uint8]:
+        return np.asarray(self.rgb.pixels, np.uint8)  # no copy: what they are
+
+    @property
+    def counts(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        return self.fir.pixels
+
+    @property
+    def stem(self) -> str:
+        return self.rgb.stem
+
+    @property
+    def dt_ns(self) -> int | None:
+        """Thermal stamp minus RGB stamp; None where either has no clock."""
+        if self.rgb.stamp_ns is None or self.fir.stamp_ns is None:
+            return None
+        return self.fir.stamp_ns - self.rgb.stamp_ns
 
 
 @dataclass(frozen=True, slots=True)

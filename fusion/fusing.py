@@ -36,7 +36,8 @@ class Stages:
 
     `frames` is the pair, RGB undistorted where that was asked for. `index` is H x W uint8 on the thermal grid
     (the windowed counts); `warped` is the same on the RGB grid, defined where `mask` (H x W uint8) is set;
-    `overlay_bgr` is `warped` through the colour table. `by_depth` is there where each pixel's depth was used.
+    `overlay_bgr` is `warped` through the colour table. `by_depth` is there where each pixel's depth was used,
+    `fir_counts` (uint16, on the grid of `fused`, 0 = none) where they were asked for.
     """
 
     frames: FrameSet
@@ -47,6 +48,7 @@ class Stages:
     table_bgr: NDArray[np.uint8]
     fused: FusedFrame
     by_depth: Warped | None = None
+    fir_counts: NDArray[np.uint16] | None = None
 
     @property
     def overlay_bgr(self) -> NDArray[np.uint8]:
@@ -94,10 +96,18 @@ class FrameFuser:
         share = self.warp.coverage
         return [f"by the rig thermal covers only {share:.2%} of RGB"] if share < LEAST_COVERAGE else []
 
-    def stages(self, frames: FrameSet, window: Window, depth_m: NDArray[np.float32] | None = None) -> Stages:
+    def stages(
+        self,
+        frames: FrameSet,
+        window: Window,
+        depth_m: NDArray[np.float32] | None = None,
+        *,
+        with_counts: bool = False,
+    ) -> Stages:
         """Fuse `frames` by `window`; `depth_m` is H x W metres on the RGB grid, 0 where there is none.
 
-        Raises `FrameError` where this frame cannot be used.
+        `with_counts` warps what thermal measured as well. Raises `FrameError` where this frame cannot be
+        used.
         """
         _, warp = self._warp_for(frames.fir.size_wh, frames.rgb.size_wh)
         stretched, below, above = index_counts(frames.counts, window.lo, window.hi)
@@ -108,11 +118,12 @@ class FrameFuser:
             if depth_m is None and warp.distance_m is None:
                 hint = "a fixed distance as well (--distance) would stand in for it"
                 raise FrameError("no depth map belongs to it", where=frames.stem, hint=hint)
-            by_depth = warp.apply(stretched, depth_m)
-            warped, mask = by_depth.index, by_depth.mask
+            by_depth = warp.apply(stretched, depth_m, fir=frames.counts if with_counts else None)
+            warped, mask, counts = by_depth.index, by_depth.mask, by_depth.counts
             coverage = float(np.count_nonzero(mask)) / mask.size
         else:
             warped, mask, coverage = warp.apply(stretched), warp.mask, warp.coverage
+            counts = warp.counts(frames.counts) if with_counts else None
         frames = _on_grid_of(warp, frames)
         bgr, kept_mask = self._blended(frames.bgr, warped, warp, None if coverage == 1 else mask)
         fused = FusedFrame(
@@ -127,7 +138,10 @@ class FrameFuser:
             frames.fir.stamp_ns,
             self._flags(frames, window, depth_m is not None),
         )
-        return Stages(frames, warp, stretched, warped, mask, self.table_bgr, fused, by_depth)
+        if counts is not None and bgr.shape[:2] != counts.shape:
+            x, y, w, h = warp.crop_xywh
+            counts = np.ascontiguousarray(counts[y : y + h, x : x + w])
+        return Stages(frames, warp, stretched, warped, mask, self.table_bgr, fused, by_depth, counts)
 
     def _blended(
         self,

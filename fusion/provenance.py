@@ -14,6 +14,7 @@ from fusion.rig_warp import DepthWarp
 from fusion.warp import Warp
 
 if TYPE_CHECKING:
+    from fusion.fusing import FrameFuser
     from fusion.lidar.lane import DepthLane
     from fusion.pipeline import Fuser
 
@@ -37,15 +38,15 @@ def describe_run(fuser: Fuser) -> dict[str, Any]:
     if "map" in config["pairing"]:
         config["pairing"]["map"] = _file_mark(config["pairing"]["map"])
     return {
-        "versions": _versions(),
+        "versions": versions(),
         "inputs": {
             "pairs": len(fuser),
             "unmatched": len(fuser.pairs.pairing.unmatched),
-            "names_sha256": _digest("\0".join(fuser.pairs.stems(index)) for index in range(len(fuser))),
+            "names_sha256": digest("\0".join(fuser.pairs.stems(index)) for index in range(len(fuser))),
             **_depth_inputs(fuser),
         },
-        "config": _plain(config),
-        "registration": _registration(fuser),
+        "config": plain(config),
+        "registration": describe_registration(fuser),
         "window": fuser.windows.record(),
     }
 
@@ -60,16 +61,17 @@ def describe_depth(lane: DepthLane, stems: Sequence[str], given: Mapping[str, bo
     config["camera"].pop("rig", None)
     camera = {"kind": type(lane.camera).__name__, **asdict(lane.camera)}  # type: ignore[call-overload]
     return {
-        "versions": _versions(DEPTH_LIBRARIES),
-        "inputs": {"frames": len(stems), "names_sha256": _digest(stems), **given},
-        "config": _plain(config),
-        "camera": _plain(camera),
+        "versions": versions(DEPTH_LIBRARIES),
+        "inputs": {"frames": len(stems), "names_sha256": digest(stems), **given},
+        "config": plain(config),
+        "camera": plain(camera),
         "T_cam_lidar": lane.T_cam_lidar.tolist(),
         "value": lane.value,
     }
 
 
-def _versions(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
+def versions(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
+    """Of ourselves, Python and the libraries that decide about pixels."""
     own = {"fusion": version("fusionprep"), "python": platform.python_version()}
     return {**own, **{name: _version(name) for name in libraries}}
 
@@ -81,11 +83,12 @@ def _version(name: str) -> str:
         return "none"
 
 
-def _digest(names: Iterable[str]) -> str:
-    digest = hashlib.sha256()
+def digest(names: Iterable[str]) -> str:
+    """SHA-256 of names in their order."""
+    total = hashlib.sha256()
     for name in names:
-        digest.update(name.encode("utf-8", "surrogateescape") + b"\n")
-    return digest.hexdigest()
+        total.update(name.encode("utf-8", "surrogateescape") + b"\n")
+    return total.hexdigest()
 
 
 def _file_mark(path: str) -> str:
@@ -98,10 +101,11 @@ def _depth_inputs(fuser: Fuser) -> dict[str, Any]:
     if not isinstance(fuser.pairs, PairsWithDepth):
         return {}
     names = [fuser.pairs.depth.name(index) for index in range(len(fuser))]
-    return {"depth_maps": sum(map(bool, names)), "depth_names_sha256": _digest(names)}
+    return {"depth_maps": sum(map(bool, names)), "depth_names_sha256": digest(names)}
 
 
-def _registration(fuser: Fuser) -> dict[str, Any]:
+def describe_registration(fuser: Fuser | FrameFuser) -> dict[str, Any]:
+    """How thermal lies on RGB, in numbers, whatever file they came from; TOML-able."""
     registration, warp = fuser.registration, fuser.warp
     record: dict[str, Any] = {
         **(
@@ -129,7 +133,7 @@ def _registration(fuser: Fuser) -> dict[str, Any]:
     return record
 
 
-def _rig(fuser: Fuser) -> dict[str, Any]:
+def _rig(fuser: Fuser | FrameFuser) -> dict[str, Any]:
     """The numbers of the rig that a warp uses, whatever file they came from."""
     if fuser.rig is None or isinstance(fuser.warp, Warp):
         raise ValueError("expected a warp by a rig")
@@ -146,11 +150,11 @@ def _rig(fuser: Fuser) -> dict[str, Any]:
     }
     if isinstance(fuser.warp, DepthWarp):
         record["value"] = fuser.warp.value
-    return _plain(record)
+    return plain(record)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Tuples as lists, as TOML has them."""
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
+        return {key: plain(inner) for key, inner in value.items()}
+    return [plain(inner) for inner in value] if isinstance(value, list | tuple) else value

@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 
 from cyclopts import Group, Parameter
 
+from fusion.cli import options
+from fusion.cli.options import RUN
+
 PAIRING = Group("Pairing", sort_key=1)
-THERMAL = Group("Thermal", sort_key=2)
-WARP = Group("Warp", sort_key=3)
-BLEND = Group("Blend and output", sort_key=4)
-RUN = Group("Run", sort_key=5)
 
 
 def blend(
@@ -41,73 +40,28 @@ def blend(
     tolerance_ms: Annotated[
         float | None, Parameter(group=PAIRING, help="Largest time difference of a pair.")
     ] = None,
-    window: Annotated[
-        tuple[float, float] | None, Parameter(group=THERMAL, help="LO HI, stretched to all colours.")
-    ] = None,
-    window_unit: Annotated[
-        Literal["fraction", "counts", "celsius", "percentile"] | None,
-        Parameter(
-            group=THERMAL, help="Unit of --window. Default with --window: fraction of the type's range."
-        ),
-    ] = None,
-    window_over: Annotated[
-        Literal["frame", "sequence", "running"] | None,
-        Parameter(group=THERMAL, help="What percentiles are taken over. Default: sequence."),
-    ] = None,
-    celsius_per_count: Annotated[
-        float | None, Parameter(group=THERMAL, help="Scale of the counts, e.g. 0.04.")
-    ] = None,
-    celsius_at_zero: Annotated[
-        float | None, Parameter(group=THERMAL, help="Temperature of count 0, e.g. -273.15.")
-    ] = None,
-    clahe: Annotated[
-        float | None, Parameter(group=THERMAL, help="Local contrast: clip limit, e.g. 2. Default: off.")
-    ] = None,
-    colormap: Annotated[
-        str | None,
-        Parameter(group=THERMAL, help="hsv, hsv-cold-hot, grey, or any of OpenCV's and matplotlib's."),
-    ] = None,
-    fir_colour: Annotated[
-        Literal["refuse", "luma"] | None, Parameter(group=THERMAL, help="What to do with thermal in colour.")
-    ] = None,
-    homography: Annotated[
-        str | None, Parameter(group=WARP, help="File with the 3x3 matrix from thermal to RGB pixels.")
-    ] = None,
-    points: Annotated[
-        str | None, Parameter(group=WARP, help="CSV of matching points: fir_x,fir_y,rgb_x,rgb_y.")
-    ] = None,
-    align: Annotated[
-        bool | None, Parameter(group=WARP, help="Find where thermal lies from the scene alone; no board.")
-    ] = None,
-    rig: Annotated[
-        str | None, Parameter(group=WARP, help="Calibration of both cameras: rig.toml, or another tool's.")
-    ] = None,
-    warp: Annotated[
-        Literal["infinity", "distance", "depth"] | None,
-        Parameter(group=WARP, help="With --rig: where things are. Default: by what else is given."),
-    ] = None,
-    distance: Annotated[
-        float | None,
-        Parameter(group=WARP, help="Metres along RGB's axis; with --depth: where a map has none."),
-    ] = None,
-    depth: Annotated[
-        str | None, Parameter(group=WARP, help="Depth maps of the RGB camera, by `fusion depth --rig`.")
-    ] = None,
-    undistort: Annotated[
-        bool | None, Parameter(group=WARP, help="With --rig: the frames are those of an ideal pinhole.")
-    ] = None,
-    outside: Annotated[
-        Literal["crop", "keep", "fill"] | None, Parameter(group=WARP, help="Where thermal does not reach.")
-    ] = None,
-    fill_bgr: Annotated[
-        tuple[int, int, int] | None, Parameter(group=WARP, help="Colour for --outside fill.")
-    ] = None,
-    method: Annotated[str | None, Parameter(group=BLEND, help="alpha or laplacian.")] = None,
-    alpha: Annotated[float | None, Parameter(group=BLEND, help="Weight of RGB. Default: 0.85.")] = None,
-    format: Annotated[
-        Literal["png", "jpg"] | None, Parameter(group=BLEND, help="png is lossless. Default: png.")
-    ] = None,
-    quality: Annotated[int | None, Parameter(group=BLEND, help="JPEG quality 1 to 100. Default: 90.")] = None,
+    window: options.Window = None,
+    window_unit: options.WindowUnit = None,
+    window_over: options.WindowOver = None,
+    celsius_per_count: options.CelsiusPerCount = None,
+    celsius_at_zero: options.CelsiusAtZero = None,
+    clahe: options.Clahe = None,
+    colormap: options.Colormap = None,
+    fir_colour: options.FirColour = None,
+    homography: options.Homography = None,
+    points: options.Points = None,
+    align: options.Align = None,
+    rig: options.Rig = None,
+    warp: options.Warp = None,
+    distance: options.Distance = None,
+    depth: options.Depth = None,
+    undistort: options.Undistort = None,
+    outside: options.Outside = None,
+    fill_bgr: options.FillBgr = None,
+    method: options.Method = None,
+    alpha: options.Alpha = None,
+    format: options.Format = None,
+    quality: options.Quality = None,
     workers: Annotated[
         int | None, Parameter(group=RUN, help="Threads. Default: one a core; the output is the same.")
     ] = None,
@@ -126,11 +80,11 @@ def blend(
     quiet: Annotated[bool, Parameter(group=RUN, help="No progress, no table.")] = False,
 ) -> None:
     """Fuse RGB and thermal images into a folder of frames."""
-    options = dict(locals())
+    given = dict(locals())
     from fusion.cli import blending
 
     blending.run_blend(
-        blending.settings_of(config, options),
+        blending.settings_of(config, given),
         [path for path in (rgb, fir) if path is not None],
         out,
         dataset=dataset,

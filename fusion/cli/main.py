@@ -43,6 +43,19 @@ DEPTH_EXAMPLES = """Examples:
   fusion depth --sparse velodyne_raw/ -o out/ --score groundtruth/
   fusion depth --sparse sparse/ --guide rgb/ --method guided -o out/"""
 
+PREPROCESS_HELP = (
+    "Turn a data set or a recording into fused frames with depth.\n\n"
+    "Streams are matched in time, thermal is warped onto RGB by the LiDAR's own depth (or as the options say)"
+    " and blended in. OUT gets fused/, mask/, fir/ (counts on the RGB grid), depth/, support/, sparse/,"
+    " frames.csv, lost.csv and run.toml; --to mcap and --to video add one file each. The work is done in"
+    " chunks: the same command run again does what is left."
+)
+PREPROCESS_EXAMPLES = """Examples:
+  fusion preprocess flight.mcap -o out/ --rig rig.toml
+  fusion preprocess flight.bag -o out/ --rgb /cam/image --fir /thermal/image --homography H.toml
+  fusion preprocess mine mine/ -o out/ --to folder --to mcap --to video
+  fusion preprocess s3://flights/one.mcap -o s3://fused/one --rig rig.toml --scheduler tcp://head:8786"""
+
 MINE_EXAMPLES = """Examples:
   fusion simulate mine mine/
   fusion simulate mine dusty/ --preset dusty --seed 3 --duration 20
@@ -117,6 +130,12 @@ app = App(
     suppress_keyboard_interrupt=False,  # ours says how to go on
 )
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
+app.command(
+    "fusion.cli.preprocess:preprocess",
+    name="preprocess",
+    help=PREPROCESS_HELP,
+    help_epilogue=PREPROCESS_EXAMPLES,
+)
 app.command("fusion.cli.depth:depth", name="depth", help=DEPTH_HELP, help_epilogue=DEPTH_EXAMPLES)
 datasets = App(name="datasets", help="List and show the data sets whose layout is known.")
 datasets.command("fusion.cli.datasets:list_datasets", name="list", help="List the known data sets.")

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from fusion.batch import RunReport
+from fusion.fusing import FrameFuser
 from fusion.pipeline import Fuser
 from fusion.report.table import LOUD_SKIPS, table
 from fusion.rig_warp import PARALLAX_M, DepthWarp, parallax_px
@@ -22,8 +23,8 @@ def plan_lines(fuser: Fuser) -> list[str]:
     rows = [
         ("pairs", f"{len(fuser)} by {pairing.rule_by}, {len(pairing.unmatched)} unmatched"),
         ("sizes", f"thermal {fir}, RGB {rgb}"),
-        ("registration", _registration(fuser)),
-        *_rig_rows(fuser),
+        ("registration", registration_text(fuser)),
+        *rig_rows(fuser),
         ("coverage", f"{warp.coverage:.1%} of RGB"),
     ]
     if fuser.pairs.ignored:
@@ -74,7 +75,8 @@ def warnings_of(fuser: Fuser, report: RunReport) -> list[str]:
     return [*warnings, *([advice] if advice else [])]
 
 
-def _registration(fuser: Fuser) -> str:
+def registration_text(fuser: Fuser | FrameFuser) -> str:
+    """How thermal comes onto RGB, in a few words."""
     registration = fuser.registration
     if registration is None:
         return _rig(fuser)
@@ -87,7 +89,7 @@ def _registration(fuser: Fuser) -> str:
     )
 
 
-def _rig(fuser: Fuser) -> str:
+def _rig(fuser: Fuser | FrameFuser) -> str:
     warp, given = fuser.warp, fuser.config.warp
     undistorted = ", RGB undistorted" if given.undistort else ""
     if not isinstance(warp, DepthWarp):
@@ -100,7 +102,7 @@ def _rig(fuser: Fuser) -> str:
     return f"rig, by {warp.value}, {otherwise}{undistorted}"
 
 
-def _rig_rows(fuser: Fuser) -> list[tuple[str, str]]:
+def rig_rows(fuser: Fuser | FrameFuser) -> list[tuple[str, str]]:
     """What a wrong distance would cost: how far off thermal is drawn for things nearer and farther."""
     warp = fuser.warp
     if isinstance(warp, Warp) or fuser.rig is None or (isinstance(warp, DepthWarp) and not warp.distance_m):

@@ -104,7 +104,7 @@ class DepthSink(RunFolder[DepthRow]):
         """Store one frame and return its row of the index. Raises `OutputError`."""
         data = {
             "support": encode_png(np.where(frame.dense.support, np.uint8(255), np.uint8(0))),
-            "sparse": _npz(frame.sparse),
+            "sparse": sparse_npz(frame.sparse),
             "picture": encode_png(picture_bgr),
             "depth": encode_png(quantised(frame.dense.value_m)),
         }
@@ -135,7 +135,8 @@ def quantised(value_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.where(value_m > 0, np.maximum(scaled, 1), 0).astype(np.uint16)
 
 
-def _npz(sparse: SparseDepth) -> bytes:
+def sparse_npz(sparse: SparseDepth) -> bytes:
+    """The samples as an NPZ: row, col, value_m, index, ring (-1: unknown), value, size_wh."""
     buffer = io.BytesIO()
     ring = np.full(len(sparse), -1, np.int32) if sparse.ring is None else sparse.ring
     np.savez(

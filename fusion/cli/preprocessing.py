@@ -1,0 +1,242 @@
+"""What `fusion preprocess` does once its options are known (the heavy imports live here)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from fusion.cli.blending import PLACES, rig_of
+from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
+from fusion.errors import InputError, UsageError
+from fusion.manifest import Layout, Manifest, load_manifest
+from fusion.preprocess.campaign import Pace, Route
+from fusion.preprocess.config import PreprocessConfig, load_preprocess_config
+from fusion.preprocess.footage import Footage, SetFootage
+from fusion.preprocess.local import Progress, no_progress
+from fusion.preprocess.recorded import RecordedFootage
+from fusion.preprocess.run import preprocess
+from fusion.preprocess.streams import resolve_streams
+from fusion.preprocess.work import PreprocessWork, make_plan, settled
+from fusion.recordings import is_recording, open_recording
+from fusion.report.campaign_text import campaign_end, campaign_plan, campaign_warnings
+from fusion.rig import Rig
+from fusion.settings import nested
+
+# option of the command -> its place in the configuration
+OWN_PLACES = {
+    "rgb": ("streams", "rgb"),
+    "fir": ("streams", "fir"),
+    "lidar": ("streams", "lidar"),
+    "lead": ("streams", "lead"),
+    "stamp": ("streams", "stamp"),
+    "tolerance_ms": ("streams", "tolerance_ms"),
+    "lidar_tolerance_ms": ("streams", "lidar_tolerance_ms"),
+    "fir_offset_ms": ("streams", "fir_offset_ms"),
+    "fir_drift_ppm": ("streams", "fir_drift_ppm"),
+    "estimate_clock": ("streams", "estimate_clock"),
+    "keep_frozen": ("streams", "keep_frozen"),
+    "begin": ("streams", "begin_s"),
+    "end": ("streams", "end_s"),
+    "densify": ("depth", "dense", "method"),
+    "to": ("outputs", "kinds"),
+    "chunk_s": ("chunk_s",),
+}
+NOT_HERE = {"pair", "rgb_key", "fir_key", "pair_map", "tolerance_ms", "align", "depth"}
+
+
+def settings_of(config: Path | None, given: Mapping[str, Any]) -> PreprocessConfig:
+    """The configuration file with the options that were given laid over it."""
+    fuse = {name: ("fuse", *place) for name, place in PLACES.items() if name not in NOT_HERE}
+    return load_preprocess_config(config, nested({**fuse, **OWN_PLACES}, given))
+
+
+def route_of(workers: int | None, cluster: str | None, scheduler: str | None) -> Route:
+    return Route(threads_of(workers), cluster == "local", scheduler or "")
+
+
+def run_preprocess(
+    config: PreprocessConfig,
+    source: str,
+    root: Path | None,
+    out: str | None,
+    *,
+    route: Route,
+    overwrite: bool,
+    dry_run: bool,
+    quiet: bool,
+) -> None:
+    if out is None and not dry_run:
+        raise UsageError("no output", where="--out", hint="give -o OUT, or only --dry-run")
+    if out is not None and "://" not in out:
+        inputs = [str(root or source)] if "://" not in source else []
+        refuse_overlap(inputs, Path(out), ("fused", "mask", "depth", "fir", "chunks"))
+    with quiet_libraries():
+        parts = list(_parts(config, source, root))
+        problems = []
+        for name, one_config, footage, rig, guessed in parts:
+            target = None if out is None else f"{out}/{name}" if len(parts) > 1 else out
+            if name and not quiet:
+                print(f"{name}:")
+            problems.append(
+                _campaign(one_config, footage, rig, guessed, target, route, overwrite, dry_run, quiet)
+            )
+    first = next((problem for problem in problems if problem is not None), None)
+    if first is not None:
+        raise first
+
+
+def _campaign(
+    config: PreprocessConfig,
+    footage: Footage,
+    rig: Rig | None,
+    guessed: list[str],
+    out: str | None,
+    route: Route,
+    overwrite: bool,
+    dry_run: bool,
+    quiet: bool,
+) -> Exception | None:
+    config = settled(config, footage.has_lidar)
+    work = PreprocessWork(footage, config, make_plan(footage, config), rig)
+    if not quiet or dry_run:
+        print("\n".join(campaign_plan(work, guessed)), flush=True)
+    if dry_run or out is None:
+        return None
+    with _progress(quiet) as progress:
+        result = preprocess(
+            work, out, route=route, overwrite=overwrite, progress=progress, say=lambda words: warn([words])
+        )
+    if not quiet:
+        print("\n".join(campaign_end(result)))
+    warn(campaign_warnings(result))
+    problem = result.report.problem()
+    if problem is None and not result.made:
+        stem, reason = result.skipped[0]
+        problem = InputError(f"no frame could be made; the first, {stem!r}: {reason}")
+    return problem
+
+
+Part = tuple[str, PreprocessConfig, Footage, "Rig | None", list[str]]
+
+
+def _parts(config: PreprocessConfig, source: str, root: Path | None) -> Iterator[Part]:
+    """The campaigns that the command stands for, each named below OUT if there are more: name, …"""
+    if root is None and is_recording(source):
+        rig = rig_of(config.fuse)
+        yield "", config, *_recorded(config, source, rig)
+        return
+    if root is None:
+        known = Path(source).exists()
+        hint = "a data set: fusion preprocess NAME ROOT -o OUT (fusion datasets list); fusion inspect says what it is"
+        raise InputError("is no recording" if known else "no such recording", where=source, hint=hint)
+    manifest = load_manifest(source)
+    layout = manifest.plan(root)
+    config = _as_the_set_says(config, layout)
+    rig = rig_of(config.fuse)
+    _check_registered(config, manifest)
+    if layout.recording is None:
+        offset_ns = _fir_offset_ns(config, rig)
+        footage = SetFootage(
+            manifest,
+            root,
+            fir_colour=config.fuse.thermal.fir_colour,
+            keep_frozen=config.streams.keep_frozen,
+            fir_offset_ns=offset_ns,
+        )
+        yield "", config, footage, rig, []
+        return
+    for path in layout.recording.files:
+        yield path.stem, config, *_recorded(config, str(path), rig)
+
+
+def _recorded(config: PreprocessConfig, path: str, rig: Rig | None) -> tuple[Footage, Rig | None, list[str]]:
+    recording = open_recording(path)
+    try:
+        streams, guessed = resolve_streams(recording, config.streams, rig, config.fuse.thermal.fir_colour)
+    finally:
+        recording.close()
+    return RecordedFootage(path, streams), rig, guessed
+
+
+def _as_the_set_says(config: PreprocessConfig, layout: Layout) -> PreprocessConfig:
+    """What was not asked for is as the manifest has it: topics, clock, tolerances, and the rig of the set."""
+    streams, recording = config.streams, layout.recording
+    if recording is not None:
+        known: dict[str, Any] = {role: recording.topics.get(role) for role in ("rgb", "fir", "lidar")}
+        known |= {"stamp": recording.stamp}
+        known |= {
+            name: recording.tolerance_ns[role] / 1e6
+            for name, role in (("tolerance_ms", "fir"), ("lidar_tolerance_ms", "lidar"))
+            if role in recording.tolerance_ns
+        }
+        given = streams.model_fields_set
+        streams = streams.model_copy(
+            update={k: v for k, v in known.items() if k not in given and v is not None}
+        )
+    warp = config.fuse.warp
+    registered = warp.rig or warp.homography or warp.points
+    files = layout.calibration.readable() if layout.calibration is not None else ()
+    settings = config.model_dump(exclude_unset=True, exclude_none=True)
+    settings["streams"] = streams.model_dump(exclude_none=True)
+    if not registered and len(files) == 1 and not layout.manifest.registered:
+        settings.setdefault("fuse", {}).setdefault("warp", {})["rig"] = str(files[0])
+    return PreprocessConfig.of(settings)
+
+
+def _check_registered(config: PreprocessConfig, manifest: Manifest) -> None:
+    warp = config.fuse.warp
+    if manifest.registered or warp.rig or warp.homography or warp.points:
+        return
+    raise InputError(
+        "its thermal images are not registered to its RGB images: as they are, they do not fit",
+        where=f"data set {manifest.name}",
+        hint="give --rig FILE, --homography FILE or --points CSV (fusion calibrate align makes a homography)",
+    )
+
+
+def _fir_offset_ns(config: PreprocessConfig, rig: Rig | None) -> int:
+    if config.streams.fir_offset_ms is not None:
+        return round(1e6 * config.streams.fir_offset_ms)
+    offsets = {} if rig is None else rig.time_offset_s
+    return round(1e9 * (offsets.get("fir", 0.0) - offsets.get("rgb", 0.0)))
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Progress]:
+    """A bar over all chunks with rate and time left on the terminal; nothing where there is none."""
+    import sys
+
+    if quiet or not sys.stderr.isatty():
+        yield no_progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    words = "{task.fields[chunks]} chunks, {task.fields[rate]:.0f} frames/s, {task.fields[left]}"
+    with Bar(
+        "preprocessing", BarColumn(), TextColumn(words), console=Console(stderr=True), transient=True
+    ) as bar:
+        task, pace = bar.add_task("", total=None, chunks="", rate=0.0, left=""), Pace()
+
+        def advance(frames_done: int, frames: int, chunks_done: int, chunks: int) -> None:
+            rate, left_s = pace(frames_done, frames)
+            left = "" if left_s is None else f"{_clock(left_s)} left"
+            bar.update(
+                task,
+                completed=frames_done,
+                total=frames,
+                chunks=f"{chunks_done}/{chunks}",
+                rate=rate,
+                left=left,
+            )
+
+        yield advance
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"

@@ -1,0 +1,136 @@
+"""Which topic of a recording plays which role, and by which clock: as asked for, or as found."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping
+from itertools import islice, pairwise
+
+from fusion.errors import InputError, UsageError
+from fusion.inspect.roles import Roles, Seen, roles_of
+from fusion.messages import reader_of
+from fusion.messages.base import CompressedImage, Points, RawImage
+from fusion.preprocess.config import StreamsConfig
+from fusion.preprocess.recorded import Streams
+from fusion.recordings.base import Recording, Topic
+from fusion.rig import Rig
+
+KINDS = {"rgb": (RawImage, CompressedImage), "fir": (RawImage, CompressedImage), "lidar": (Points,)}
+LIDAR_TOLERANCE_NS = 50_000_000  # half the turn of a scanner at ten a second
+LOOKED_AT = 50
+
+
+def resolve_streams(
+    recording: Recording, config: StreamsConfig, rig: Rig | None = None, fir_colour: str = "refuse"
+) -> tuple[Streams, list[str]]:
+    """The streams of `recording` as `config` wants them, and what was guessed, in words.
+
+    The clock of a rig (`time_offset_s`) counts where the configuration does not give another. Raises
+    `UsageError` for topics that are not there or are no images or clouds, `InputError` where a camera
+    cannot be told.
+    """
+    topics, said = _topics(recording, config)
+    intervals = {role: _interval_ns(recording, topic) for role, topic in topics.items()}
+    lead = config.lead
+    if lead not in topics:
+        raise UsageError(f"{lead} cannot lead: the recording has no {lead}", where=recording.name)
+    tolerance = {
+        role: _tolerance_ns(role, config, min(intervals[role], intervals[lead]))
+        for role in topics
+        if role != lead
+    }
+    offsets = {} if rig is None else {role: rig.time_offset_s.get(role, 0.0) for role in topics}
+    if config.fir_offset_ms is not None:
+        offsets = {**offsets, "fir": config.fir_offset_ms / 1e3, "rgb": 0.0}
+    streams = Streams(
+        topics,
+        lead,
+        config.stamp,
+        tolerance,
+        {role: round(1e9 * s) for role, s in offsets.items() if s},
+        {"fir": config.fir_drift_ppm * 1e-6} if config.fir_drift_ppm else {},
+        config.keep_frozen,
+        fir_colour,
+        config.begin_s,
+        config.end_s,
+    )
+    return streams, said
+
+
+def _topics(recording: Recording, config: StreamsConfig) -> tuple[dict[str, Topic], list[str]]:
+    asked = {"rgb": config.rgb, "fir": config.fir, "lidar": config.lidar}
+    topics = {role: _named(recording, role, name) for role, name in asked.items() if name}
+    open_roles = [role for role, name in asked.items() if name is None]
+    said: list[str] = []
+    if open_roles:
+        roles = roles_of([_seen(recording, topic) for topic in recording.topics])
+        for role in open_roles:
+            found = _guessed(recording, role, roles, topics)
+            if found is not None:
+                topics[role] = found
+                said.append(f"{role}: {found.name}, {roles.chosen[role][1]}")  # type: ignore[index]
+    return topics, said
+
+
+def _guessed(recording: Recording, role: str, roles: Roles, taken: Mapping[str, Topic]) -> Topic | None:
+    ambiguous = roles.ambiguous.get(role)  # type: ignore[call-overload]
+    if ambiguous:
+        names = ", ".join(guess.topic.name for guess in ambiguous)
+        raise InputError(
+            f"more than one topic can be {role}: {names}", where=recording.name, hint=f"--{role}"
+        )
+    found = roles.chosen.get(role)  # type: ignore[call-overload]
+    if found is not None and found[0] not in taken.values():
+        return found[0]
+    if role == "lidar":
+        return None
+    raise InputError(
+        f"no topic can be {role}", where=recording.name, hint=f"--{role} TOPIC; {_listed(recording)}"
+    )
+
+
+def _named(recording: Recording, role: str, name: str) -> Topic:
+    found = [topic for topic in recording.topics if topic.name == name]
+    if not found:
+        raise UsageError(f"no topic {name}", where=f"--{role}", hint=_listed(recording))
+    usable = [topic for topic in found if reader_of(topic).kind in KINDS[role]]
+    if not usable:
+        what = f"{name} is {found[0].schema.name}, which holds no {'points' if role == 'lidar' else 'images'}"
+        raise UsageError(what, where=f"--{role}", hint=_listed(recording))
+    return usable[0]
+
+
+def _listed(recording: Recording) -> str:
+    listed = [f"{topic.name} ({topic.schema.name})" for topic in recording.topics]
+    more = f" and {len(listed) - 30} more" if len(listed) > 30 else ""
+    return f"it has {', '.join(listed[:30]) or 'no topics'}{more}"
+
+
+def _seen(recording: Recording, topic: Topic) -> Seen:
+    try:
+        reader = reader_of(topic)
+    except InputError:
+        return Seen(topic, None)
+    if reader.kind not in (RawImage, CompressedImage, Points):
+        return Seen.of(topic, reader.kind)
+    packet = next(iter(recording.packets([topic])), None)
+    return Seen.of(topic, reader.kind, None if packet is None else reader.message(packet.data))
+
+
+def _interval_ns(recording: Recording, topic: Topic) -> int:
+    logs = [packet.log_ns for packet in islice(recording.packets([topic]), LOOKED_AT)]
+    steps = [later - log for log, later in pairwise(logs)]
+    return max(1, round(statistics.median(steps))) if steps else 100_000_000
+
+
+def _tolerance_ns(role: str, config: StreamsConfig, interval_ns: int) -> int:
+    """As asked for, else half the interval of the denser of both streams (LiDAR: half a turn)."""
+    if role == "fir" and config.tolerance_ms is not None:
+        return round(1e6 * config.tolerance_ms)
+    if "lidar" in (role, config.lead):
+        return (
+            LIDAR_TOLERANCE_NS
+            if config.lidar_tolerance_ms is None
+            else round(1e6 * config.lidar_tolerance_ms)
+        )
+    return interval_ns // 2
