@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from fusion.frames import FrameSet, Image
-from fusion.pairing import Pairing, PairingRule, pair, stamps_of
+from fusion.pairing import Pair, Pairing, PairingRule, Unmatched, pair, stamps_of
 from fusion.sources import open_source
 from fusion.sources.base import Entry, Source
 from fusion.sources.channels import RgbtFiles, open_rgbt
+from fusion.sources.radiometric import RadiometricFiles, is_radiometric, open_radiometric_files
+
+UNREGISTERED = "the visible images lie in the thermal files, and are not registered to the counts"
 
 
 class Pairs(Protocol):
@@ -58,6 +61,11 @@ class PairedSources:
     def __len__(self) -> int:
         return len(self.pairing.pairs)
 
+    @property
+    def fir_files(self) -> list[str]:
+        """The thermal images' files, pair by pair (of a video, what its frames are called)."""
+        return [self._fir.entries[pair.fir].where for pair in self.pairing.pairs]
+
     def _entries(self, index: int) -> tuple[Entry, Entry]:
         rgb, fir, _ = self.pairing.pairs[index]
         return self._rgb.entries[rgb], self._fir.entries[fir]
@@ -79,6 +87,46 @@ class PairedSources:
     def close(self) -> None:
         self._rgb.close()
         self._fir.close()
+
+
+class PairedRadiometric:
+    """Pairs from radiometric JPEGs: the counts of each, and the visible image in it. Not registered.
+
+    Files without one of the two are `pairing.unmatched`, each with its reason.
+    """
+
+    def __init__(self, files: RadiometricFiles) -> None:
+        self.name = files.name
+        self.ignored = files.ignored
+        self._files = files
+        count, lost = len(files.entries), [Unmatched(f.role, f.where, f.reason) for f in files.left_out]
+        n_rgb, n_fir = (count + sum(one.role == role for one in lost) for role in ("rgb", "fir"))
+        pairs = tuple(Pair(k, k, 0) for k in range(count))
+        self.pairing = Pairing("channels", pairs, tuple(lost), None, (UNREGISTERED,), n_rgb, n_fir)
+
+    def __len__(self) -> int:
+        return len(self._files.entries)
+
+    @property
+    def fir_files(self) -> list[str]:
+        """The thermal images' files, pair by pair."""
+        return [entry.where for entry in self._files.entries]
+
+    def stems(self, index: int) -> tuple[str, str]:
+        stem = self._files.entries[index].stem
+        return stem, stem
+
+    def read(self, index: int) -> FrameSet:
+        return self._files.read(index)
+
+    def read_fir(self, index: int) -> Image:
+        return self._files.read_fir(index)
+
+    def changed_ns(self, index: int) -> int:
+        return _changed_ns([self._files.entries[index]])
+
+    def close(self) -> None:
+        self._files.close()
 
 
 class PairedChannels:
@@ -119,14 +167,22 @@ def open_pairs(
 ) -> Pairs:
     """Open folders, glob patterns, videos or single files and pair them; nothing is decoded yet.
 
-    `fir` None: `rgb` names 4-channel RGB+T files. `fir_colour` says what to do with thermal images
-    that are in colour. Raises `InputError` where nothing is found or nothing pairs.
+    `fir` None: `rgb` names 4-channel RGB+T files, or radiometric JPEGs. `fir_colour` says what to do with
+    thermal images that are in colour. Raises `InputError` where nothing is found or nothing pairs.
     """
     if fir is None:
-        return PairedChannels(open_rgbt(rgb))
+        return open_radiometric(rgb) if is_radiometric(rgb) else PairedChannels(open_rgbt(rgb))
     rgb_source = open_source(rgb, "rgb")
     fir_source = open_source(fir, "fir", fir_colour=fir_colour)
     return PairedSources(rgb_source, fir_source, rule or PairingRule())
+
+
+def open_radiometric(spec: str | Path) -> PairedRadiometric:
+    """Open a folder, a glob pattern or one file of radiometric JPEGs with visible images in them.
+
+    Raises `InputError` where nothing is there or no file holds both.
+    """
+    return PairedRadiometric(open_radiometric_files(spec))
 
 
 def _read(source: Source, index: int, stamps: Sequence[int | None] | None) -> Image:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Size = tuple[int, int]
+Counts = NDArray[np.uint8] | NDArray[np.uint16]
 Spans = tuple[NDArray[np.int64], NDArray[np.int64]]
 _A = TypeVar("_A", bound=np.ndarray)
 
@@ -180,9 +181,31 @@ class Warp:
 
         return resample(np.ascontiguousarray(index), *self._sampling, out)
 
+    def counts(self, fir: Counts) -> NDArray[np.uint16]:
+        """The counts (h x w uint8 or uint16, thermal grid) on the RGB grid: H x W uint16, 0 outside `mask`.
+
+        Sampled bilinearly where `apply` samples, with its rounding. Always a new array. Raises `ValueError`
+        for another size or type.
+        """
+        fir = checked_counts(fir, self.fir_size_wh)
+        if self._sampling is None:
+            return np.array(fir, np.uint16)
+        from fusion.kernels16 import resample_counts
+
+        return resample_counts(fir, *self._sampling, self.mask)
+
     def rgb(self, bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The RGB image on the grid of the result: itself. (Warps from a rig may undistort it.)"""
         return bgr
+
+
+def checked_counts(fir: Counts, fir_size_wh: Size) -> Counts:
+    """`fir`, if it is h x w uint8 or uint16 of the thermal grid. Raises `ValueError`."""
+    shape = tuple(fir_size_wh[::-1])
+    if fir.shape != shape or fir.dtype not in (np.uint8, np.uint16):
+        what = f"expected {shape} uint8 or uint16 on the thermal grid, got {fir.shape} {fir.dtype}"
+        raise ValueError(what)
+    return fir
 
 
 def _inverse(H_rgb_fir: NDArray[np.float64], fir_size_wh: Size) -> NDArray[np.float64]:

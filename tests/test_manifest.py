@@ -187,7 +187,7 @@ def test_without_the_variable_the_home_folder_is_searched(
 def test_an_unknown_name_lists_the_known_and_the_near(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("FUSION_DATASETS", raising=False)
     with pytest.raises(
-        UsageError, match=r"'MRSS'.*did you mean msrs\?.*known: .*mil_multispectral.*roadscene"
+        UsageError, match=r"'MRSS'.*did you mean msrs\b.*known: .*mil_multispectral.*roadscene"
     ):
         load_manifest("MRSS")
 

@@ -34,7 +34,7 @@ from fusion.settings import nested
 from fusion.sinks.depth import PER_METRE
 from fusion.sinks.folder import FolderSink
 from fusion.sources import Source, open_source
-from fusion.sync import Pairs, open_pairs
+from fusion.sync import PairedSources, Pairs, open_pairs
 
 if TYPE_CHECKING:
     from fusion.cli.aligning import Aligned
@@ -148,12 +148,7 @@ def manifest_of(dataset: str | None, settings: BlendConfig, inputs: Sequence[str
         raise UsageError("a data set has one root", where="--dataset", hint=hint)
     manifest = load_manifest(dataset)
     warp = settings.warp
-    if not manifest.registered and not (warp.homography or warp.points or warp.align or warp.rig):
-        raise InputError(
-            "its thermal images are not registered to its RGB images: as they are, they do not fit",
-            where=f"data set {manifest.name}",
-            hint="give --rig FILE, --homography FILE, --points CSV, or --align",
-        )
+    manifest.refuse_unfit(registration=bool(warp.homography or warp.points or warp.align or warp.rig))
     return manifest
 
 
@@ -166,10 +161,14 @@ def open_inputs(
     rule, fir_colour = replace(settings.pairing.rule(), fir_offset_ns=offset_ns), settings.thermal.fir_colour
     if manifest is None:
         return open_pairs(inputs[0], inputs[1] if len(inputs) == 2 else None, rule, fir_colour=fir_colour)
-    rgb, fir = manifest.globs(inputs[0])
-    if not settings.pairing.model_fields_set:
-        rule = replace(manifest.pairing_rule(inputs[0]), fir_offset_ns=offset_ns)
-    return open_pairs(rgb, fir, rule, fir_colour=fir_colour)
+    layout = manifest.plan(inputs[0])
+    if "rgbt" in layout.roles:
+        return open_pairs(layout["rgbt"].glob)
+    if "fir" not in layout.roles:
+        raise manifest.no_images()
+    own = None if settings.pairing.model_fields_set else layout["fir"].rule
+    rule = rule if own is None else replace(own, fir_offset_ns=offset_ns)
+    return PairedSources(layout.open("rgb"), layout.open("fir", fir_colour), rule)
 
 
 def rig_of(settings: BlendConfig) -> Rig | None:

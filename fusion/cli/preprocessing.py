@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
 from fusion.errors import InputError, UsageError
 from fusion.manifest import Layout, Manifest, load_manifest
 from fusion.preprocess.campaign import Pace, Route
+from fusion.preprocess.clocks import clock_of, in_words
 from fusion.preprocess.config import PreprocessConfig, load_preprocess_config
 from fusion.preprocess.footage import Footage, SetFootage
 from fusion.preprocess.local import Progress, no_progress
@@ -72,8 +74,8 @@ def run_preprocess(
     if out is not None and "://" not in out:
         inputs = [str(root or source)] if "://" not in source else []
         refuse_overlap(inputs, Path(out), ("fused", "mask", "depth", "fir", "chunks"))
-    with quiet_libraries():
-        parts = list(_parts(config, source, root))
+    with quiet_libraries(), ExitStack() as open_things:
+        parts = list(_parts(config, source, root, open_things))
         problems = []
         for name, one_config, footage, rig, guessed in parts:
             target = None if out is None else f"{out}/{name}" if len(parts) > 1 else out
@@ -121,15 +123,17 @@ def _campaign(
 Part = tuple[str, PreprocessConfig, Footage, "Rig | None", list[str]]
 
 
-def _parts(config: PreprocessConfig, source: str, root: Path | None) -> Iterator[Part]:
+def _parts(
+    config: PreprocessConfig, source: str, root: Path | None, open_things: ExitStack
+) -> Iterator[Part]:
     """The campaigns that the command stands for, each named below OUT if there are more: name, …"""
     if root is None and is_recording(source):
         rig = rig_of(config.fuse)
-        yield "", config, *_recorded(config, source, rig)
+        yield "", config, *_recorded(config, source, rig, open_things)
         return
     if root is None:
         known = Path(source).exists()
-        hint = "a data set: fusion preprocess NAME ROOT -o OUT (fusion datasets list); fusion inspect says what it is"
+        hint = "a data set: fusion preprocess NAME ROOT -o OUT; fusion inspect says what a path is"
         raise InputError("is no recording" if known else "no such recording", where=source, hint=hint)
     manifest = load_manifest(source)
     layout = manifest.plan(root)
@@ -137,27 +141,39 @@ def _parts(config: PreprocessConfig, source: str, root: Path | None) -> Iterator
     rig = rig_of(config.fuse)
     _check_registered(config, manifest)
     if layout.recording is None:
-        offset_ns = _fir_offset_ns(config, rig)
-        footage = SetFootage(
-            manifest,
-            root,
-            fir_colour=config.fuse.thermal.fir_colour,
-            keep_frozen=config.streams.keep_frozen,
-            fir_offset_ns=offset_ns,
-        )
-        yield "", config, footage, rig, []
+        offset_ns, said = _fir_offset_ns(config, rig), list[str]()
+        colour, keep = config.fuse.thermal.fir_colour, config.streams.keep_frozen
+        footage = SetFootage(manifest, root, fir_colour=colour, keep_frozen=keep, fir_offset_ns=offset_ns)
+        open_things.callback(footage.close)
+        if config.streams.estimate_clock:
+            found = clock_of(footage)
+            said.append(in_words(found))
+            offset_ns = found.offset_ns
+            footage = SetFootage(manifest, root, fir_colour=colour, keep_frozen=keep, fir_offset_ns=offset_ns)
+        yield "", config, footage, rig, said
         return
     for path in layout.recording.files:
-        yield path.stem, config, *_recorded(config, str(path), rig)
+        yield path.stem, config, *_recorded(config, str(path), rig, open_things)
 
 
-def _recorded(config: PreprocessConfig, path: str, rig: Rig | None) -> tuple[Footage, Rig | None, list[str]]:
-    recording = open_recording(path)
-    try:
+def _recorded(
+    config: PreprocessConfig, path: str, rig: Rig | None, open_things: ExitStack
+) -> tuple[Footage, Rig | None, list[str]]:
+    with closing(open_recording(path)) as recording:
         streams, guessed = resolve_streams(recording, config.streams, rig, config.fuse.thermal.fir_colour)
-    finally:
-        recording.close()
-    return RecordedFootage(path, streams), rig, guessed
+    footage = RecordedFootage(path, streams)
+    open_things.callback(footage.close)
+    if config.streams.estimate_clock:
+        own = replace(streams, offset_ns={}, drift={})
+        with closing(RecordedFootage(path, own)) as unshifted:
+            found = clock_of(unshifted)
+        guessed.append(in_words(found))
+        shifted = replace(
+            streams, offset_ns={"fir": found.offset_at(footage.begin_ns)}, drift={"fir": found.drift}
+        )
+        footage = RecordedFootage(path, shifted)
+        open_things.callback(footage.close)
+    return footage, rig, guessed
 
 
 def _as_the_set_says(config: PreprocessConfig, layout: Layout) -> PreprocessConfig:

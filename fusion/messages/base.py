@@ -1,9 +1,9 @@
-"""What messages mean, whatever wire they came over: plain values, arrays still as the bytes they were sent in."""
+"""What messages mean, whatever wire they came over: plain values, arrays still as the bytes sent."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ Bytes = bytes | memoryview
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """`stamp_ns` is when it was measured, by its sender; None where the message has no stamp, or one of zero."""
+    """`stamp_ns` is when it was measured, by its sender; None where there is no stamp, or one of zero."""
 
     stamp_ns: int | None = None
     frame_id: str = ""
@@ -22,7 +22,7 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class RawImage:
-    """Pixels as they were sent. `encoding` is ROS's word (``mono16``, ``bayer_rggb8``, ``16UC1``, ``yuv422_yuy2``)."""
+    """Pixels as they were sent. `encoding` is ROS's word (``mono16``, ``bayer_rggb8``, ``16UC1``)."""
 
     header: Header
     width: int
@@ -35,14 +35,15 @@ class RawImage:
 
 @dataclass(frozen=True, slots=True)
 class CompressedImage:
-    """A picture in a file's form. `format` is the sender's word (``jpeg``, ``16UC1; compressedDepth png``)."""
+    """A picture in a file's form. `format` is the sender's word (``jpeg``, ``16UC1; compressedDepth``)."""
 
     header: Header
     format: str
     data: Bytes
 
 
-class PointField(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class PointField:
     name: str
     offset: int  # bytes from the beginning of a point
     dtype: np.dtype  # in the byte order of the data
@@ -51,7 +52,11 @@ class PointField(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """`height` rows of `width` points, `point_step` bytes each, rows `row_step` bytes apart."""
+    """`height` rows of `width` points, `point_step` bytes each, rows `row_step` bytes apart.
+
+    The bytes may end with the last field of the last point. `T_frame_points` takes the points to the header's
+    frame, where they are not in it already (foxglove's `pose`).
+    """
 
     header: Header
     width: int
@@ -60,11 +65,12 @@ class Points:
     point_step: int
     row_step: int
     data: Bytes
+    T_frame_points: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """ROS's calibration of a camera. `model` is its word (``plumb_bob``, ``equidistant``); D, K 3x3, R 3x3, P 3x4."""
+    """ROS's calibration of a camera. `model` is its word (``plumb_bob``); D, K 3x3, R 3x3, P 3x4."""
 
     header: Header
     width: int

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
-import statistics
-from bisect import bisect_left
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fusion.errors import InputError, UsageError
 from fusion.pairing.rule import Match, Pair, PairingRule, ms
+from fusion.timing.match import default_tolerance_ns, nearest
 
 if TYPE_CHECKING:
     from fusion.sources.base import Entry
+
+_Stamps = NDArray[np.object_]
 
 _UNIT_NS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}
 _STAMP_FORMS = "10, 13, 16 or 19 digits for s, ms, us or ns, or seconds.fraction"
@@ -62,12 +65,13 @@ def by_stamp(rgb: Sequence[Entry], fir: Sequence[Entry], rule: PairingRule) -> M
     match = Match()
     a, b = _timeline(rgb, rule.rgb_key, match.rgb, "RGB"), _timeline(fir, rule.fir_key, match.fir, "thermal")
     b = [(t + rule.fir_offset_ns, j) for t, j in b]
-    times = [t for t, _ in a], [t for t, _ in b]
+    # stamps in names may be longer than 64 bits
+    times = np.array([t for t, _ in a], object), np.array([t for t, _ in b], object)
     limit = _default_tolerance(*times) if rule.tolerance_ns is None else rule.tolerance_ns
     match.tolerance_ns = limit
     # A tie goes to the earlier thermal and to the later RGB image: pairs cannot cross, and streams that
     # run exactly half an interval apart still pair.
-    to_b, to_a = _nearest(*times, later=False), _nearest(times[1], times[0], later=True)
+    to_b, to_a = nearest(*times, later=False).tolist(), nearest(times[1], times[0], later=True).tolist()
     for k, (t, i) in enumerate(a):
         u, j = b[to_b[k]]
         if to_a[to_b[k]] == k and abs(u - t) <= limit:
@@ -124,26 +128,11 @@ def _timeline(
     return line
 
 
-def _nearest(times: list[int], others: list[int], *, later: bool) -> list[int]:
-    """For each of `times` the index of the nearest of `others` (both ascending, no value twice)."""
-    nearest = []
-    for t in times:
-        k = bisect_left(others, t)
-        before = others[k - 1] if k else None
-        after = others[k] if k < len(others) else None
-        gap = 0 if before is None or after is None else (after - t) - (t - before)
-        nearest.append(
-            k if before is None or (after is not None and (gap < 0 or (gap == 0 and later))) else k - 1
-        )
-    return nearest
-
-
-def _default_tolerance(a: list[int], b: list[int]) -> int:
-    """Half the median interval of the denser stream, in whole ns."""
-    steps = [[t - s for s, t in pairwise(times)] for times in (a, b) if len(times) > 1]
-    if not steps:
+def _default_tolerance(a: _Stamps, b: _Stamps) -> int:
+    tolerance = default_tolerance_ns(a, b)
+    if tolerance is None:
         raise UsageError("no tolerance follows from one time stamp each", hint="give --tolerance-ms")
-    return min(statistics.median_low(d) + statistics.median_high(d) for d in steps) // 4
+    return tolerance
 
 
 def _too_far(side: str, gap: int, tolerance: int) -> str:

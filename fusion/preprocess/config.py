@@ -96,6 +96,9 @@ def _validated(settings: Mapping[str, Any], where: str) -> PreprocessConfig:
     except ValidationError as error:
         raise UsageError(first_problem(error), where=where) from None
     streams = config.streams
+    if streams.estimate_clock and (streams.fir_offset_ms is not None or streams.fir_drift_ppm):
+        hint = "give one of estimate_clock and fir_offset_ms, fir_drift_ppm"
+        raise UsageError("the clock is given and to be estimated", where=where, hint=hint)
     if streams.begin_s is not None and streams.end_s is not None and streams.begin_s >= streams.end_s:
         raise UsageError(f"{streams.begin_s:g} to {streams.end_s:g} s is no time range", where=where)
     unknown = [kind for kind in config.outputs.kinds if kind not in OUTPUTS]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from fusion.clouds import read_cloud
 from fusion.errors import FrameError, InputError
 from fusion.frames import FrameSet, Image, PointCloud
 from fusion.manifest import Layout, Manifest
-from fusion.pairing import stamp_in_name
+from fusion.pairing import stamp_in_name, stamps_of
 from fusion.preprocess.chunks import Chunk
 from fusion.provenance import digest
 from fusion.sync import PairedSources, Pairs, open_pairs
@@ -71,6 +72,8 @@ class Footage(Protocol):
     def fir_at(self, position: int) -> Image:
         """The thermal image at (or next after) a position. Raises `FrameError`."""
         ...
+
+    def close(self) -> None: ...
 
 
 class SetFootage:
@@ -162,6 +165,21 @@ class SetFootage:
 
     def fir_at(self, position: int) -> Image:
         return self._pairs.read_fir(position)
+
+    def pictures(self, role: str, longest_s: float) -> Iterator[Image]:
+        """The images of one folder as their stamps order them; those that cannot be read are left out."""
+        manifest, root, colour, *_ = self._spec
+        camera: Literal["rgb", "fir"] = "rgb" if role == "rgb" else "fir"
+        source = manifest.plan(root).open(camera, colour)
+        stamped = sorted((t, k) for k, t in enumerate(stamps_of(source.entries)) if t is not None)
+        for stamp, index in stamped:
+            if stamp - stamped[0][0] > 1e9 * longest_s:
+                return
+            with suppress(FrameError):
+                yield replace(source.read(index), stamp_ns=stamp)
+
+    def close(self) -> None:
+        self._pairs.close()
 
     @property
     def _by_time(self) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, pairwise
@@ -28,14 +30,17 @@ PLACES, LOOKED_AT = (
     40,
 )  # where a stream is looked at to know its rate and delay, and how many messages there
 SLACK_NS = 300_000_000  # how much beyond the delays seen a message may be late
+LONGEST_LOOK_NS = 3_000_000_000
 MOST_APART_NS = 30_000_000_000
+LIDAR_TOLERANCE_NS = 50_000_000  # half the turn of a scanner at ten a second
 
 
 @dataclass(frozen=True, slots=True)
 class Streams:
     """Which topic plays which role, and how stamps are taken: all in nanoseconds, resolved.
 
-    `offset_ns` and `drift` bring a role's stamps to the reference's clock:
+    Roles without a `tolerance_ns` get half the interval of the denser of their stream and the leader's,
+    clouds half a turn. `offset_ns` and `drift` bring a role's stamps to the reference's clock:
     own + offset + drift * (own - the recording's begin).
     """
 
@@ -71,7 +76,6 @@ class Pace:
 
     interval_ns: int
     delay_ns: tuple[int, int] | None
-    seen: int
 
 
 class RecordedFootage:
@@ -92,7 +96,10 @@ class RecordedFootage:
         if self.begin_ns >= self.end_ns:
             hint = f"the recording lasts {(end - begin) / 1e9:.3f} s"
             raise InputError("no messages in that time range", where=path, hint=hint)
-        self.paces = {role: self._pace(role) for role in streams.topics}
+        self.paces = self._paces()
+        self.tolerance_ns = {
+            role: self._tolerance_ns(role) for role in streams.topics if role != streams.lead
+        }
         self._reach_ns = self._reach()
         self.rate_hz = 1e9 / self.paces[streams.lead].interval_ns
         self.positions = 1 + (self.end_ns - 1 - self.begin_ns) // self.paces["fir"].interval_ns
@@ -117,6 +124,16 @@ class RecordedFootage:
     def recording(self) -> Recording:
         return self._recording
 
+    def pictures(self, role: str, longest_s: float) -> Iterator[Image]:
+        """The images of one stream as they come, with their stamps; unreadable ones are left out."""
+        end = min(self.end_ns, self.begin_ns + round(1e9 * longest_s))
+        for packet in self._recording.packets([self.streams.topics[role]], self.begin_ns, end):
+            with suppress(FrameError):
+                yield self._image(role, packet.data, packet.log_ns, self._stamp_ns(role, packet))
+
+    def close(self) -> None:
+        self._recording.close()
+
     def describe(self) -> Mapping[str, Any]:
         """The same recording in another container is the same footage: only what was recorded counts."""
         streams = self.streams
@@ -127,7 +144,7 @@ class RecordedFootage:
             "end_ns": self.end_ns,
             "lead": streams.lead,
             "stamp": streams.stamp,
-            "tolerance_ns": dict(streams.tolerance_ns),
+            "tolerance_ns": dict(self.tolerance_ns),
             "offset_ns": dict(streams.offset_ns),
             "drift": dict(streams.drift),
             "keep_frozen": streams.keep_frozen,
@@ -233,7 +250,7 @@ class RecordedFootage:
         roles = {role: [item for item in waiting if item.role == role] for role in self.streams.topics}
         stamps = {role: [item.stamp_ns for item in items] for role, items in roles.items()}
         optional = frozenset({"lidar"} if self.streams.lead != "lidar" else ())
-        matched = match_streams(stamps, self.streams.lead, self.streams.tolerance_ns, optional)
+        matched = match_streams(stamps, self.streams.lead, self.tolerance_ns, optional)
 
         def ours(item: _Item) -> bool:
             return chunk.begin <= item.log_ns < chunk.end and item.log_ns < until and not item.taken
@@ -242,8 +259,9 @@ class RecordedFootage:
             items = {role: roles[role][index] for role, index in members.items()}
             lead = items[self.streams.lead]
             if ours(lead):
-                lead.taken = True
                 yield self._moment(lead, items)
+            for item in items.values():  # the leader may be forgotten before those that came later
+                item.taken = item.taken or item.log_ns < until
         for lost in matched.lost:
             item = roles[lost.role][lost.index]
             if ours(item):
@@ -276,23 +294,53 @@ class RecordedFootage:
 
     # --- what samples tell
 
-    def _pace(self, role: str) -> Pace:
-        topic, span = self.streams.topics[role], self.end_ns - self.begin_ns
-        steps: list[int] = []
-        delays: list[int] = []
-        seen = 0
+    def _paces(self) -> dict[str, Pace]:
+        steps: dict[str, list[int]] = {role: [] for role in self.streams.topics}
+        delays: dict[str, list[int]] = {role: [] for role in self.streams.topics}
+        seen = Counter[str]()
+
+        def count(role: str, some: Sequence[Packet]) -> None:
+            seen[role] += len(some)
+            steps[role].extend(later.log_ns - packet.log_ns for packet, later in pairwise(some))
+            delays[role].extend(d for d in (self._delay(role, packet) for packet in some) if d is not None)
+
         for place in range(PLACES):
-            start = self.begin_ns + span * place // PLACES
-            some = list(islice(self._recording.packets([topic], start, self.end_ns), LOOKED_AT))
-            seen += len(some)
-            steps += [later.log_ns - packet.log_ns for packet, later in pairwise(some)]
-            delays += [d for d in (self._delay(role, packet) for packet in some) if d is not None]
-        if not seen:
-            raise InputError(f"no message on {topic.name}", where=self.name, hint="--begin, --end")
-        interval = int(np.median(steps)) if steps else span
+            for role, some in self._some(place).items():
+                count(role, some)
+        for role, topic in self.streams.topics.items():
+            if not seen[role]:  # it is none of the places: wherever it begins
+                packets = self._recording.packets([topic], self.begin_ns, self.end_ns)
+                count(role, list(islice(packets, LOOKED_AT)))
+            if not seen[role]:
+                raise InputError(f"no message on {topic.name}", where=self.name, hint="--begin, --end")
+        return {role: self._pace(steps[role], delays[role]) for role in steps}
+
+    def _some(self, place: int) -> dict[str, list[Packet]]:
+        """The first messages of each stream from a place in the recording on."""
+        span = self.end_ns - self.begin_ns
+        found: dict[str, list[Packet]] = {role: [] for role in self.streams.topics}
+        start = self.begin_ns + span * place // PLACES
+        for packet in self._recording.packets([*self._role], start, self.end_ns):
+            some = found[self._role[packet.topic]]
+            if len(some) < LOOKED_AT:
+                some.append(packet)
+            if packet.log_ns > start + LONGEST_LOOK_NS or all(len(s) >= LOOKED_AT for s in found.values()):
+                break
+        return found
+
+    def _pace(self, steps: Sequence[int], delays: Sequence[int]) -> Pace:
+        interval = int(np.median(steps)) if steps else self.end_ns - self.begin_ns
         usual = int(np.median(delays)) if delays else 0
         near = [d for d in delays if abs(d - usual) <= MOST_APART_NS]
-        return Pace(max(interval, 1), (min(near), max(near)) if near else None, seen)
+        return Pace(max(interval, 1), (min(near), max(near)) if near else None)
+
+    def _tolerance_ns(self, role: str) -> int:
+        given = self.streams.tolerance_ns.get(role)
+        if given is not None:
+            return given
+        if "lidar" in (role, self.streams.lead):
+            return LIDAR_TOLERANCE_NS
+        return min(self.paces[role].interval_ns, self.paces[self.streams.lead].interval_ns) // 2
 
     def _delay(self, role: str, packet: Packet) -> int | None:
         try:
@@ -308,4 +356,4 @@ class RecordedFootage:
         if apart > MOST_APART_NS:
             hint = "--stamp log takes log times; --fir-offset-ms brings thermal to RGB's clock"
             raise InputError(f"the streams' stamps lie {apart / 1e9:.1f} s apart", where=self.name, hint=hint)
-        return margin_ns(self.streams.tolerance_ns) + apart + 2 * SLACK_NS
+        return margin_ns(self.tolerance_ns) + apart + 2 * SLACK_NS

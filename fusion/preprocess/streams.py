@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping
-from itertools import islice, pairwise
 
 from fusion.errors import InputError, UsageError
 from fusion.inspect.roles import Roles, Seen, roles_of
@@ -16,8 +14,6 @@ from fusion.recordings.base import Recording, Topic
 from fusion.rig import Rig
 
 KINDS = {"rgb": (RawImage, CompressedImage), "fir": (RawImage, CompressedImage), "lidar": (Points,)}
-LIDAR_TOLERANCE_NS = 50_000_000  # half the turn of a scanner at ten a second
-LOOKED_AT = 50
 
 
 def resolve_streams(
@@ -30,15 +26,13 @@ def resolve_streams(
     cannot be told.
     """
     topics, said = _topics(recording, config)
-    intervals = {role: _interval_ns(recording, topic) for role, topic in topics.items()}
     lead = config.lead
     if lead not in topics:
         raise UsageError(f"{lead} cannot lead: the recording has no {lead}", where=recording.name)
-    tolerance = {
-        role: _tolerance_ns(role, config, min(intervals[role], intervals[lead]))
-        for role in topics
-        if role != lead
-    }
+    given = {"fir": config.tolerance_ms, "lidar": config.lidar_tolerance_ms}
+    if lead == "lidar":  # then RGB is what goes with the clouds, and thermal too
+        given = {"rgb": config.lidar_tolerance_ms, "fir": config.lidar_tolerance_ms}
+    tolerance = {role: round(1e6 * ms) for role, ms in given.items() if ms is not None and role in topics}
     offsets = {} if rig is None else {role: rig.time_offset_s.get(role, 0.0) for role in topics}
     if config.fir_offset_ms is not None:
         offsets = {**offsets, "fir": config.fir_offset_ms / 1e3, "rgb": 0.0}
@@ -115,22 +109,3 @@ def _seen(recording: Recording, topic: Topic) -> Seen:
         return Seen.of(topic, reader.kind)
     packet = next(iter(recording.packets([topic])), None)
     return Seen.of(topic, reader.kind, None if packet is None else reader.message(packet.data))
-
-
-def _interval_ns(recording: Recording, topic: Topic) -> int:
-    logs = [packet.log_ns for packet in islice(recording.packets([topic]), LOOKED_AT)]
-    steps = [later - log for log, later in pairwise(logs)]
-    return max(1, round(statistics.median(steps))) if steps else 100_000_000
-
-
-def _tolerance_ns(role: str, config: StreamsConfig, interval_ns: int) -> int:
-    """As asked for, else half the interval of the denser of both streams (LiDAR: half a turn)."""
-    if role == "fir" and config.tolerance_ms is not None:
-        return round(1e6 * config.tolerance_ms)
-    if "lidar" in (role, config.lead):
-        return (
-            LIDAR_TOLERANCE_NS
-            if config.lidar_tolerance_ms is None
-            else round(1e6 * config.lidar_tolerance_ms)
-        )
-    return interval_ns // 2

@@ -16,6 +16,7 @@ import tomlkit
 from fusion.errors import FrameError, InputError
 from fusion.fusing import FrameFuser, Sizes
 from fusion.lidar.lane import DepthLane
+from fusion.lidar.sparse import Value
 from fusion.preprocess.chunks import Chunk, Done
 from fusion.preprocess.config import PreprocessConfig
 from fusion.preprocess.footage import Dropped, Footage, Moment
@@ -82,10 +83,12 @@ class PreprocessWork:
 
     def _open(self) -> None:
         self._lock = threading.Lock()
+        self._fuser: FrameFuser | None = None
         self._ready: tuple[FrameMaker, list[Output]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_lock", "_ready")}
+        opened = ("_lock", "_fuser", "_ready")
+        return {name: value for name, value in self.__dict__.items() if name not in opened}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -97,10 +100,16 @@ class PreprocessWork:
         return sum(chunk.frames for chunk in self.chunks)
 
     def fuser(self) -> FrameFuser:
-        """What fuses its frames; made anew at every call."""
+        """What fuses its frames; built once a process."""
+        with self._lock:
+            if self._fuser is None:
+                plan, value = self.plan, self._depth_value()
+                self._fuser = FrameFuser(self.config.fuse, plan.sizes, self.rig, plan.registration, value)
+            return self._fuser
+
+    def _depth_value(self) -> Value | None:
         lane = self._lane() if self.onto_rgb else None
-        value = None if lane is None else lane.value
-        return FrameFuser(self.config.fuse, self.plan.sizes, self.rig, self.plan.registration, value)
+        return None if lane is None else lane.value
 
     @property
     def onto_rgb(self) -> bool:
@@ -118,10 +127,11 @@ class PreprocessWork:
 
     def parts(self) -> tuple[FrameMaker, list[Output]]:
         """What makes and what keeps frames; built once a process."""
+        fuser = self.fuser()
         with self._lock:
             if self._ready is None:
                 lane = self._lane()
-                maker = FrameMaker(self.config, self.fuser(), self.plan.windows, lane, self.onto_rgb)
+                maker = FrameMaker(self.config, fuser, self.plan.windows, lane, self.onto_rgb)
                 output = self.config.fuse.output
                 camera = None if lane is None else lane.camera
                 setup = Setup(self.rig, camera, self.footage.rate_hz, output.format, output.quality)

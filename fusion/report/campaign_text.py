@@ -41,8 +41,8 @@ def _stream_rows(footage: RecordedFootage) -> list[tuple[str, str]]:
         if streams.stamp == "header" and pace.delay_ns is not None:
             least, most = (ns / 1e6 for ns in pace.delay_ns)
             words.append(f"recorded {least:.1f} to {most:.1f} ms after its stamp")
-        if role in streams.tolerance_ns:
-            words.append(f"within {streams.tolerance_ns[role] / 1e6:.1f} ms of {streams.lead}")
+        if role in footage.tolerance_ns:
+            words.append(f"within {footage.tolerance_ns[role] / 1e6:.1f} ms of {streams.lead}")
         if streams.offset_ns.get(role):
             words.append(f"clock shifted by {streams.offset_ns[role] / 1e6:+.3f} ms")
         if streams.drift.get(role):

@@ -14,6 +14,8 @@ from fusion.sources.base import Entry
 from fusion.sources.folders import GLOB, IMAGE, list_folder, list_pattern, read_bytes
 from fusion.sources.roles import to_role
 
+_TWO_SOURCES = "give RGB and thermal as two sources; a single one holds 4 channels, or radiometric JPEGs"
+
 
 class RgbtFiles:
     """Four-channel images: red, green, blue, and thermal where alpha would be.
@@ -39,7 +41,7 @@ class RgbtFiles:
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         if channels != 4:
             what = f"expected 4 channels (R, G, B, thermal), found {channels}"
-            raise FrameError(what, where=entry.where, hint="give RGB and thermal as two sources")
+            raise FrameError(what, where=entry.where, hint=_TWO_SOURCES)
         bgr, flags = to_role(np.ascontiguousarray(pixels[:, :, :3]), "rgb", entry.where, "refuse")
         fir = np.ascontiguousarray(pixels[:, :, 3])
         return FrameSet(Image(bgr, entry.stem, entry.stamp_ns, flags), Image(fir, entry.stem, entry.stamp_ns))

@@ -11,6 +11,7 @@ from pathlib import Path
 from fusion.codecs import decode_image
 from fusion.errors import FrameError, InputError
 from fusion.frames import Image
+from fusion.radiometric.flir import flir_in, shows_temperatures
 from fusion.sources.base import Entry, Role, SourceKind
 from fusion.sources.roles import FirColour, to_role
 
@@ -42,10 +43,21 @@ class FileSource:
         self._max_pixels = max_pixels
 
     def read(self, index: int) -> Image:
-        """Decode entry `index`. Raises `FrameError` when that file cannot be read or used."""
+        """Decode entry `index`. Raises `FrameError` when that file cannot be read or used.
+
+        Of a radiometric JPEG the thermal role gets the counts, not the coloured picture (flag
+        ``fir-radiometric``); the RGB role gets the picture (flag ``rgb-thermal-preview``).
+        """
         entry = self.entries[index]
-        pixels = decode_image(read_bytes(entry.where), entry.where, self._max_pixels)
+        data = read_bytes(entry.where)
+        if self.role == "fir":
+            flir = flir_in(data, entry.where, self._max_pixels, dji=self._fir_colour == "luma")
+            if flir is not None:
+                return Image(flir.counts, entry.stem, entry.stamp_ns, ("fir-radiometric",))
+        pixels = decode_image(data, entry.where, self._max_pixels)
         pixels, flags = to_role(pixels, self.role, entry.where, self._fir_colour)
+        if self.role == "rgb" and shows_temperatures(data):
+            flags = (*flags, "rgb-thermal-preview")
         return Image(pixels, entry.stem, entry.stamp_ns, flags)
 
     def close(self) -> None:
