@@ -29,7 +29,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 def mutated(data: bytes, rng: Random, others: Sequence[bytes], text: bool) -> bytes:
     """`data` with one to four kinds of damage; text is damaged as text three times of four."""
-    for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
+    for _ in range(rng.choice((1, 1, 1, 1, 1, 2, 3, 4))):
         if text and rng.random() < 0.75:
             data = rng.choice(_OF_TEXT)(data.decode("utf-8", "replace"), rng).encode("utf-8", "replace")
         else:

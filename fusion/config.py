@@ -67,6 +67,11 @@ class ThermalConfig(Group):
     colormap: str
     fir_colour: Literal["refuse", "luma"] = "refuse"
 
+    @property
+    def by_camera(self) -> bool:
+        """Whether degrees are turned into counts by what the thermal files say of their camera."""
+        return self.window_unit == "celsius" and self.celsius_per_count is self.celsius_at_zero is None
+
     def rule(self) -> WindowRule:
         return WindowRule(
             *self.window, self.window_unit, self.window_over, self.celsius_per_count, self.celsius_at_zero
@@ -138,7 +143,8 @@ def _validated(settings: Mapping[str, Any], where: str) -> BlendConfig:
     except ValidationError as error:
         raise UsageError(first_problem(error), where=where) from None
     warp = _checked_warp(config.warp, where)
-    config.thermal.rule()
+    if not config.thermal.by_camera:
+        config.thermal.rule()
     return config.model_copy(update={"warp": warp})
 
 

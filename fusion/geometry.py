@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 # A camera at the LiDAR's origin that looks along +x, upright.
 T_CAM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float64)
 _LARGEST_COEFFICIENT = 1e9
+_TABLE = 1024  # places a table of distorted radii has
+_SETTLED = 1e-11  # a step of Newton's method after which the next changes nothing that a double holds
 RIGID_TOLERANCE = 1e-4  # calibration files are written with few decimals
 
 
@@ -263,18 +265,41 @@ class PinholeCamera(_Lens):
         return across, b * k + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
 
     def _undistort(self, a0: Floats, b0: Floats) -> tuple[Floats, Floats]:
-        """Bisection without the tangential part, then Newton's method; NaN where no direction falls there."""
-        limit, r0 = min(self.valid_radius(), 1e3), np.hypot(a0, b0)
-        r = _inverse(lambda at: at * self._radial(at * at)[0], r0, limit, 30)
-        scale = np.divide(r, r0, out=np.ones_like(r), where=r0 > 0)
+        """Bisection without the tangential part, then Newton's method; NaN where no direction falls there.
+
+        Of many pixels a table of bisections is where most can start from; the rest is done again.
+        """
+        r0 = np.hypot(a0, b0)
+        if r0.size <= _TABLE:
+            return self._newton(a0, b0, r0, self._straight(r0))
+        few = np.linspace(0, r0.max(), _TABLE)
+        a, b = self._newton(a0, b0, r0, np.interp(r0, few, self._straight(few)))
+        left = np.isnan(a)
+        if left.any():
+            a0, b0, r0 = a0[left], b0[left], r0[left]
+            a[left], b[left] = self._newton(a0, b0, r0, self._straight(r0))
+        return a, b
+
+    def _straight(self, r0: Floats) -> Floats:
+        """Which radii come out as `r0`, without the tangential part."""
+        limit = min(self.valid_radius(), 1e3)
+        return _inverse(lambda at: at * self._radial(at * at)[0], r0, limit, 30)
+
+    def _newton(self, a0: Floats, b0: Floats, r0: Floats, start: Floats) -> tuple[Floats, Floats]:
+        """Which (a, b) are distorted to (a0, b0), from the radii `start` on; NaN where none was arrived at."""
+        limit = min(self.valid_radius(), 1e3)
+        scale = np.divide(start, r0, out=np.ones_like(start), where=r0 > 0)
         a, b = scale * a0, scale * b0
         with np.errstate(all="ignore"):
             for _ in range(10):
                 fa, fb = self._distort(a, b)
                 ra, rb, (aa, ab, bb, det) = fa - a0, fb - b0, self._growth(a, b)
-                a, b = a - (bb * ra - ab * rb) / det, b - (aa * rb - ab * ra) / det
+                da, db = (bb * ra - ab * rb) / det, (aa * rb - ab * ra) / det
+                a, b = a - da, b - db
                 shrink = np.minimum(1, limit / np.maximum(np.hypot(a, b), 1e-12))
                 a, b = a * shrink, b * shrink
+                if max(np.abs(da).max(), np.abs(db).max()) < _SETTLED:
+                    break
             fa, fb = self._distort(a, b)
             arrived = np.hypot(fa - a0, fb - b0) < 1e-9 * np.maximum(1, r0)
             arrived &= self._growth(a, b)[3] > 0

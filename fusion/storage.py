@@ -312,7 +312,7 @@ def _open_fsspec(url: str) -> tuple[Any, str]:
     from fsspec.core import url_to_fs  # here: a folder needs none of it
 
     try:
-        return url_to_fs(url)
+        return url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         raise UsageError(str(error), where=url) from None
     except Exception as error:

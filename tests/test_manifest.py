@@ -305,3 +305,6 @@ def test_differences_from_what_is_known_are_told(tmp_path: Path, good: Manifest)
         "thermal bit depth: good has 16, found 8"
     ]
     assert good.differences(pairs=1, rgb=rgb, fir=fir) == []
+    exact = load_manifest(write(tmp_path, GOOD + "[checks.counts]\npairs = 7\n"))
+    assert exact.differences(pairs=7) == []
+    assert exact.differences(pairs=8) == ["pairs: good has 7, found 8"]

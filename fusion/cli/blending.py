@@ -107,6 +107,7 @@ def run_blend(
         depth = depth_of(settings, pairs, rig, open_things)
         if out is None or (dry_run and not preview):
             return
+        settings = window_in_counts(settings, pairs)
         alignment = align_pairs(pairs, quiet=quiet) if settings.warp.align else None
         registration = None if alignment is None else alignment.registration
         fuser = Fuser(pairs if depth is None else PairsWithDepth(pairs, depth), settings, rig, registration)
@@ -130,6 +131,26 @@ def run_blend(
         if not quiet:
             print("\n".join(closing_lines(fuser, report, out)))
         warn(warnings_of(fuser, report))
+
+
+def window_in_counts(settings: BlendConfig, pairs: Pairs) -> BlendConfig:
+    """A window in degrees without a scale becomes one in counts by the constants in radiometric files.
+
+    Raises `UsageError` where there are none, `InputError` where they differ from file to file.
+    """
+    thermal = settings.thermal
+    if not thermal.by_camera:
+        return settings
+    from fusion.sources.radiometric import common_planck, is_radiometric
+
+    files = getattr(pairs, "fir_files", [])
+    if not files or not is_radiometric(files[0]):
+        thermal.rule()  # says what is missing
+    planck = common_planck(files)
+    window = (float(planck.counts_at(thermal.window[0])), float(planck.counts_at(thermal.window[1])))
+    counts = thermal.model_copy(update={"window": window, "window_unit": "counts"})
+    counts.rule()
+    return settings.model_copy(update={"thermal": counts})
 
 
 def align_pairs(pairs: Pairs, *, quiet: bool) -> Aligned:

@@ -61,6 +61,11 @@ MINE_EXAMPLES = """Examples:
   fusion simulate mine dusty/ --preset dusty --seed 3 --duration 20
   fusion simulate mine fast/ --speed 3 --max-rate 200 --rings 16"""
 
+RECORD_EXAMPLES = """Examples:
+  fusion simulate record mine/ mine.bag --form rosbag1
+  fusion simulate record mine/ mine.mcap --form mcap-protobuf --compression zstd
+  fusion simulate record mine/ bag/ --form rosbag2 --split-mb 100"""
+
 CALIBRATE_EXAMPLES = """Examples:
   fusion calibrate board board.pdf --kind chessboard --cols 9 --rows 6 --spacing-mm 80
   fusion calibrate stereo rgb/ fir/ --board board.toml -o cameras.toml
@@ -161,6 +166,12 @@ simulate.command(
     "fusion.cli.simulate:simulate_pairs",
     name="pairs",
     help="Draw unregistered RGB-thermal pairs of a mine, with their truth.",
+)
+simulate.command(
+    "fusion.cli.record:simulate_record",
+    name="record",
+    help="Write a simulated mine as a robot's recorder would have written it.",
+    help_epilogue=RECORD_EXAMPLES,
 )
 app.command(simulate)
 calibrate = App(

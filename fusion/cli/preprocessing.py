@@ -13,7 +13,6 @@ from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
 from fusion.errors import InputError, UsageError
 from fusion.manifest import Layout, Manifest, load_manifest
 from fusion.preprocess.campaign import Pace, Route
-from fusion.preprocess.clocks import clock_of, in_words
 from fusion.preprocess.config import PreprocessConfig, load_preprocess_config
 from fusion.preprocess.footage import Footage, SetFootage
 from fusion.preprocess.local import Progress, no_progress
@@ -146,6 +145,8 @@ def _parts(
         footage = SetFootage(manifest, root, fir_colour=colour, keep_frozen=keep, fir_offset_ns=offset_ns)
         open_things.callback(footage.close)
         if config.streams.estimate_clock:
+            from fusion.preprocess.clocks import clock_of, in_words  # here: SciPy is slow to import
+
             found = clock_of(footage)
             said.append(in_words(found))
             offset_ns = found.offset_ns
@@ -159,11 +160,13 @@ def _parts(
 def _recorded(
     config: PreprocessConfig, path: str, rig: Rig | None, open_things: ExitStack
 ) -> tuple[Footage, Rig | None, list[str]]:
-    with closing(open_recording(path)) as recording:
-        streams, guessed = resolve_streams(recording, config.streams, rig, config.fuse.thermal.fir_colour)
-    footage = RecordedFootage(path, streams)
-    open_things.callback(footage.close)
+    recording = open_recording(path)
+    open_things.callback(recording.close)
+    streams, guessed = resolve_streams(recording, config.streams, rig, config.fuse.thermal.fir_colour)
+    footage = RecordedFootage(path, streams, recording)
     if config.streams.estimate_clock:
+        from fusion.preprocess.clocks import clock_of, in_words  # here: SciPy is slow to import
+
         own = replace(streams, offset_ns={}, drift={})
         with closing(RecordedFootage(path, own)) as unshifted:
             found = clock_of(unshifted)

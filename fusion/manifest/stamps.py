@@ -88,7 +88,7 @@ class StampFiles:
     def _group(self, home: Path, files: Sequence[Path]) -> list[int | None]:
         lines = self._lines[home]
         found = [_NUMBER.search(file.stem) for file in files]
-        numbers = [int(match[1]) if match and len(match[1]) < 19 else -1 for match in found]
+        numbers = [int(match[1]) if match else -1 for match in found]
         if len(set(numbers)) == len(files) and all(0 <= k < len(lines) for k in numbers):
             return [lines[k] for k in numbers]
         if len(files) == len(lines):

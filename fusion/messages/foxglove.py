@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from fusion.errors import FrameError
 from fusion.messages import make
 from fusion.messages.base import (
@@ -44,6 +42,9 @@ _POINTS: Tree = {
 }
 
 
+_STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
 class Shape(NamedTuple):
     kind: type[Message]
     tree: Tree
@@ -71,8 +72,9 @@ def _points(values: dict[str, Any]) -> Points:
     fields = tuple((field["name"], field["offset"], field["type"]) for field in values["fields"])
     made = make.point_fields(fields, "foxglove")
     at = _numbers(values["pose"]["position"], values["pose"]["orientation"])
-    T = make.transforms([(0, 0, "its frame", "its points", *at)]).transforms[0].T_parent_child
-    moved = None if np.array_equal(T, np.eye(4)) else T
+    moved = None
+    if at != _STILL:
+        moved = make.transforms([(0, 0, "its frame", "its points", *at)]).transforms[0].T_parent_child
     return Points(header(values), len(data) // step, 1, made, step, len(data), data, moved)
 
 

@@ -3,8 +3,9 @@
 The work travels as one task whose result all chunks take as input: the scheduler can make it again when the
 worker that holds it dies, which it could not with scattered data. What is handed to the scheduler are calls
 of the standard library: it needs no fusion, and a worker that has none fails with a word instead of breaking
-off. Workers store and commit chunks themselves; only a summary comes back. Few more chunks are handed out
-than there are threads, so that a long campaign costs the scheduler no memory.
+off. Workers store and commit chunks themselves; only a summary comes back. No more chunks are handed out than
+there are threads: a long campaign costs the scheduler no memory, and a chunk that kills its worker brings no
+other one, waiting there, into the suspicion that it did.
 """
 
 from __future__ import annotations
@@ -41,7 +42,6 @@ LOOK_EVERY_S = 1.0  # how often the scheduler is looked after while no chunk end
 CONNECT_S = 30.0  # for a scheduler to answer
 SOON_S = 5.0  # for the first worker to join before anything is said
 COUNT_EVERY_S = 5.0  # how often the workers are counted
-AHEAD = 2  # chunks handed out for each thread
 LOGGERS = ("distributed", "distributed.client", "tornado.application")
 
 
@@ -149,7 +149,7 @@ class Room:
             if not self._threads and not self._alone:
                 _tell(self._say, f"no worker is left at {_address(self._client)}: waiting for one to join")
             self._alone = not self._threads
-        return AHEAD * max(1, self._threads)
+        return max(1, self._threads)
 
 
 def _outcome(client: Client, chunk: Chunk, future: Future) -> Committed | Failed:

@@ -85,9 +85,10 @@ class RecordedFootage:
     message belongs to does not depend on how the recording is cut.
     """
 
-    def __init__(self, path: str, streams: Streams) -> None:
+    def __init__(self, path: str, streams: Streams, recording: Recording | None = None) -> None:
+        """`recording` is the one at `path` where it is open already: it is closed with the footage."""
         self._path, self.streams, self.has_lidar = path, streams, "lidar" in streams.topics
-        self._open()
+        self._open(recording)
         if self._recording.span_ns is None:
             raise InputError("the recording has no messages", where=path)
         begin, end = self._recording.span_ns
@@ -104,8 +105,8 @@ class RecordedFootage:
         self.rate_hz = 1e9 / self.paces[streams.lead].interval_ns
         self.positions = 1 + (self.end_ns - 1 - self.begin_ns) // self.paces["fir"].interval_ns
 
-    def _open(self) -> None:
-        self._recording: Recording = open_recording(self._path)
+    def _open(self, recording: Recording | None = None) -> None:
+        self._recording: Recording = recording or open_recording(self._path)
         self.name = self._recording.name
         self._readers: dict[str, MessageReader] = {}
         self._role: dict[Topic, str] = {}

@@ -21,6 +21,7 @@ from fusion.sinks.run_folder import first_difference
 from fusion.storage import RunStorage, open_storage
 
 INDEX, LOST, RUN = "frames.csv", "lost.csv", "run.toml"
+JOINED = ("fused.mcap", "fused.mp4")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +59,15 @@ def preprocess(
         if report.whole:
             store.write(INDEX, tally.index(rows_of(store, work, report.whole)))
             store.write(LOST, _lost_csv(report))
-        if not report.failed and tally.made:
+        if tally.made:
+            whole = [chunk for chunk in work.chunks if chunk.index in report.whole]
             for output in work.parts()[1]:
-                tally.products += output.finish(work.chunks, store)
+                tally.products += output.finish(whole, store)
 
     def opening(store: RunStorage) -> None:
+        if overwrite:  # the records are gone, and what they named; this is what no record names
+            for name in (INDEX, LOST, *JOINED, *store.names("parts")):
+                store.remove(name)
         store.write(RUN, tomlkit.dumps(work.description).encode())
 
     report = run_campaign(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from fusion.recordings.files import DamagedError
 NAME = "metadata.yaml"
 ROOT = "rosbag2_bagfile_information"
 MAX_BYTES = 1 << 24
+_DEEPEST = 32
 NEWEST = 9  # the version of rosbag2's metadata that is known
 
 
@@ -57,6 +58,7 @@ def _tree(text: str | bytes) -> dict[str, Any]:
     if any(mark in text for mark in marks):  # type: ignore[operator]
         raise DamagedError("it holds YAML tags or merged keys")
     try:
+        _check_depth(yaml.parse(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
         tree = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # noqa: S506 - both are safe
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
         raise DamagedError(f"it is no YAML: {' '.join(str(error).split())[:120]}") from None
@@ -65,26 +67,44 @@ def _tree(text: str | bytes) -> dict[str, Any]:
     return tree
 
 
+def _check_depth(events: Iterable[Any]) -> None:
+    """A loader in C builds nested nodes by recursion, and ends the process where its stack ends."""
+    depth = 0
+    for event in events:
+        kind = type(event).__name__
+        depth += kind.endswith(("SequenceStartEvent", "MappingStartEvent"))
+        depth -= kind.endswith(("SequenceEndEvent", "MappingEndEvent"))
+        if depth > _DEEPEST:
+            raise DamagedError(f"it is nested more than {_DEEPEST} deep")
+
+
+def _word(value: Any) -> str:
+    """Text of a plain value: that of a list which refers to lists could be as long as one likes."""
+    if isinstance(value, list | dict | set | tuple):
+        raise TypeError("a list or table stands where a word should")
+    return str(value)
+
+
 def _metadata(root: dict[str, Any]) -> Metadata:
     topics = root.get("topics_with_message_count") or []
     counts: dict[tuple[str, str], int] = {}
     encodings: dict[tuple[str, str], str] = {}
     for row in topics:
         topic = row["topic_metadata"]
-        key = str(topic["name"]), normal_type(str(topic["type"]))
+        key = _word(topic["name"]), normal_type(_word(topic["type"]))
         counts[key] = counts.get(key, 0) + int(row["message_count"])
-        encodings[key] = str(topic.get("serialization_format", "cdr"))
+        encodings[key] = _word(topic.get("serialization_format", "cdr"))
     spans: dict[str, tuple[int, int]] = {}
     for row in root.get("files") or []:
         start = int(row["starting_time"]["nanoseconds_since_epoch"])
         end = start + int(row["duration"]["nanoseconds"]) + 1
-        spans[last_part(str(row["path"]))] = (start, end) if int(row["message_count"]) else (0, 0)
-    mode = str(root.get("compression_mode") or "").lower()
+        spans[last_part(_word(row["path"]))] = (start, end) if int(row["message_count"]) else (0, 0)
+    mode = _word(root.get("compression_mode") or "").lower()
     return Metadata(
-        tuple(str(name) for name in root["relative_file_paths"] or []),
-        str(root.get("storage_identifier", "")),
+        tuple(_word(name) for name in root["relative_file_paths"] or []),
+        _word(root.get("storage_identifier", "")),
         int(root.get("version", 0)),
-        str(root.get("compression_format") or "").lower(),
+        _word(root.get("compression_format") or "").lower(),
         "" if mode == "none" else mode,
         counts,
         encodings,

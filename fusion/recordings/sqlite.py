@@ -20,6 +20,8 @@ from fusion.recordings.unpack import MAX_CHUNK_BYTES
 MAGIC = b"SQLite format 3\0"
 MAX_TOPICS = 1 << 16
 MAX_TIME_NS = (1 << 63) - 1
+# What sqlite says of a damaged file may quote its bytes, and Python then fails to decode the message.
+_DAMAGES = (sqlite3.Error, UnicodeDecodeError)
 _new_packet = tuple.__new__  # half the cost of calling Packet
 _IN_TIME = "timestamp >= :start AND timestamp < :end"
 _IN_ORDER = "SELECT topic_id, timestamp, rowid, data FROM messages WHERE {} ORDER BY timestamp, rowid"
@@ -45,7 +47,7 @@ class Sqlite3Recording:
         self._closed = False
         try:
             self._open()
-        except sqlite3.Error as error:
+        except _DAMAGES as error:
             self.close()
             raise InputError(f"nothing of it can be read: {error}", where=self.shown) from error
         except BaseException:
@@ -106,7 +108,7 @@ class Sqlite3Recording:
             with closing(sqlite3.connect(copy, isolation_level=None)) as db:
                 db.execute("PRAGMA trusted_schema = OFF")
                 db.execute("PRAGMA journal_mode = DELETE")
-        except sqlite3.Error as error:
+        except _DAMAGES as error:
             self.noted.add(f"{self.shown}: {names} beside it is left out: {error}")
             return
         self.noted.add(f"{self.shown}: was not closed: read with {names}")
@@ -137,7 +139,7 @@ class Sqlite3Recording:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
         try:
             rows = db.execute(query, (MAX_TOPICS,)).fetchall()
-        except sqlite3.Error as error:
+        except _DAMAGES as error:
             if "no such table" not in str(error):
                 self.noted.add(f"{self.shown}: its message definitions cannot be read: {error}")
             return {}
@@ -147,7 +149,7 @@ class Sqlite3Recording:
     def _own_metadata(self, db: sqlite3.Connection) -> str:
         try:
             row = db.execute("SELECT metadata FROM metadata ORDER BY rowid DESC LIMIT 1").fetchone()
-        except sqlite3.Error:
+        except _DAMAGES:
             return ""
         return row[0] if row and isinstance(row[0], str) else ""
 
@@ -161,7 +163,7 @@ class Sqlite3Recording:
             odd = "timestamp IS NULL OR timestamp < 0 OR timestamp >= ?"
             query = f"SELECT count(*) FROM messages WHERE {odd}"  # noqa: S608
             count = db.execute(query, (MAX_TIME_NS,)).fetchone()[0]
-        except sqlite3.Error as error:
+        except _DAMAGES as error:
             self._damaged(error)
             span = None
             for stamp, _ in self._places(db, 0, MAX_TIME_NS, (-1, -1), "1"):
@@ -171,7 +173,7 @@ class Sqlite3Recording:
             self.noted.add(f"{self.shown}: {count} messages without a possible time are left out")
         return None if ends[0] is None else (int(ends[0]), int(ends[1]) + 1)
 
-    def _damaged(self, error: sqlite3.Error) -> None:
+    def _damaged(self, error: Exception) -> None:
         self._ordered = False
         self.noted.add(f"{self.shown}: is damaged ({error}): what is whole is read")
 
@@ -204,7 +206,7 @@ class Sqlite3Recording:
                             odd += 1
                         else:
                             yield _new_packet(Packet, (topic, stamp, data))
-            except sqlite3.Error as error:
+            except _DAMAGES as error:
                 ordered = False
                 self._damaged(error)
             if not ordered:
@@ -233,7 +235,7 @@ class Sqlite3Recording:
             for stamp, place in places.execute("SELECT stamp, place FROM places ORDER BY stamp, place"):
                 try:
                     key, data = db.execute(query, (place,)).fetchone() or (None, None)
-                except sqlite3.Error:
+                except _DAMAGES:
                     key, data = None, None
                 topic = ids.get(key) if type(key) is int else None
                 if topic is None or type(data) is not bytes:
@@ -256,7 +258,7 @@ class Sqlite3Recording:
                         reached = row
                     if type(stamp) is int and (stamp, row) > last:
                         yield stamp, row
-            except sqlite3.Error as error:
+            except _DAMAGES as error:
                 broken = True
                 self.noted.add(f"{self.shown}: is damaged ({error}): what is whole is read")
             if not broken:

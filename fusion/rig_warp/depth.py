@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusion.errors import FrameError
 from fusion.geometry import FisheyeCamera, Floats
 from fusion.rig import Rig, RigCamera
-from fusion.rig_warp.fixed import RigWarp
+from fusion.rig_warp.fixed import RigWarp, metres_of
 from fusion.rig_warp.views import (
     MARGIN_PX,
     Sampling,
@@ -73,14 +73,13 @@ class DepthWarp:
         undistort: bool = False,
     ) -> None:
         """Raises as `RigWarp.fixed` does."""
-        mode = "infinity" if distance_m is None else "distance"
-        self.fixed = RigWarp.fixed(rig, fir_size_wh, rgb_size_wh, mode, distance_m, undistort)
-        self.views = views = self.fixed.views
+        self.views = views = Views.of(rig, fir_size_wh, rgb_size_wh, undistort)
+        rays = np.concatenate([views.rays(uv) for _, uv in blocks(views.output.size_wh)])
+        self.fixed = RigWarp.of(views, metres_of(distance_m), rays)
         self.value: Value = value or views.value
         self.distance_m = distance_m
         self.mask, self.coverage, self.full = self.fixed.mask, self.fixed.coverage, self.fixed.full
         self.crop_xywh, self.border_ltrb = self.fixed.crop_xywh, self.fixed.border_ltrb
-        rays = np.concatenate([views.rays(uv) for _, uv in blocks(views.output.size_wh)])
         per_value = views.per_value(rays, self.value) @ views.T_fir_rgb[:3, :3].T
         self._ray = locked(np.ascontiguousarray(per_value.T, np.float32))
         self._half = locked(_half_extents(views, rays))

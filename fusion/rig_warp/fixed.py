@@ -62,17 +62,15 @@ class RigWarp:
         """
         if (mode == "distance") != (distance_m is not None) or mode not in ("infinity", "distance"):
             raise ValueError(f"expected infinity, or distance with metres, got {mode}, {distance_m}")
-        metres = math.inf if distance_m is None else float(distance_m)
-        if not metres > 0:
-            raise ValueError(f"expected a positive distance, got {distance_m}")
+        metres = metres_of(distance_m)
         return cls.of(Views.of(rig, fir_size_wh, rgb_size_wh, undistort), metres)
 
     @classmethod
-    def of(cls, views: Views, distance_m: float) -> RigWarp:
-        """The same of views that are there already."""
+    def of(cls, views: Views, distance_m: float, rays: Floats | None = None) -> RigWarp:
+        """The same of views that are there already, and of the `rays` of all output pixels, where known."""
         from fusion import rig_warp_kernels as loops
 
-        mask, sampling = _maps(views, distance_m)
+        mask, sampling = _maps(views, distance_m, rays)
         from_rgb = None if views.output is views.rgb else _rgb_maps(views)
         H, W = mask.shape
         scratch = np.zeros(W, np.int64), np.zeros(W + 1, np.int64), np.zeros(W + 1, np.int64)
@@ -119,13 +117,22 @@ class RigWarp:
         return np.ascontiguousarray(np.stack(planes, -1))
 
 
-def _maps(views: Views, metres: float) -> tuple[NDArray[np.uint8], Sampling]:
+def metres_of(distance_m: float | None) -> float:
+    """None stands for infinity. Raises `ValueError` for what is no positive number."""
+    metres = math.inf if distance_m is None else float(distance_m)
+    if not metres > 0:
+        raise ValueError(f"expected a positive distance, got {distance_m}")
+    return metres
+
+
+def _maps(views: Views, metres: float, rays: Floats | None) -> tuple[NDArray[np.uint8], Sampling]:
     """Mask, and where to sample the thermal image, of every output pixel."""
     W, H = views.output.size_wh
     mask = np.empty((H, W), np.uint8)
     offset, fraction = np.empty((H, W), np.uint32), np.empty((H, W), np.uint16)
     for rows, uv in blocks((W, H)):
-        xy, seen = views.thermal_px(views.rays(uv), metres)
+        known = None if rays is None else rays[rows.start * W : rows.stop * W]
+        xy, seen = views.thermal_px(views.rays(uv) if known is None else known, metres)
         seen = seen & inside(xy, views.fir.size_wh)
         mask[rows] = np.where(seen, np.uint8(255), np.uint8(0)).reshape(-1, W)
         offset[rows], fraction[rows] = (a.reshape(-1, W) for a in sampling_of(xy, seen, views.fir.size_wh))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import struct
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fusion.radiometric import read_flir
 from tests.cli.conftest import Answer
 from tests.worlds import read, tree, write, write_pairs
 
@@ -392,3 +394,31 @@ def test_real_radiometric_counts(fusion: Fusion, tmp_path: Path, shared_data: Pa
     answer = fusion("blend", rgb, tiff, "-o", tmp_path / "a")
     assert answer.code == 0
     assert np.unique(read(tmp_path / "a/fused/scene.png").reshape(-1, 3), axis=0).shape[0] > 100
+
+
+def test_a_window_in_degrees_by_what_radiometric_files_say(
+    fusion: Fusion, shared_data: Path, tmp_path: Path
+) -> None:
+    """Counts and degrees are not proportional there: the camera's constants tell."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    shutil.copy(shared_data / "radiometric" / "FLIR.jpg", photos)
+    window = ("--window", 26, 50, "--window-unit", "celsius")
+    done = fusion("blend", photos, "-o", tmp_path / "out", *window)
+    assert done.code == 0, done.err
+    with (tmp_path / "out" / "run.toml").open("rb") as file:
+        lo, hi = tomllib.load(file)["config"]["thermal"]["window"]
+    flir = read_flir((photos / "FLIR.jpg").read_bytes(), "FLIR.jpg")
+    degrees = flir.celsius()
+    low, high = (flir.counts <= lo), (flir.counts >= hi)
+    assert degrees[low].max() <= 26 + 0.1 < degrees[~low].min() + 0.2
+    assert degrees[high].min() >= 50 - 0.1
+
+
+def test_a_window_in_degrees_of_plain_images_needs_a_scale(fusion: Fusion, tmp_path: Path) -> None:
+    rgb, fir = write_pairs(tmp_path, 2)
+    window = ("--window", 26, 50, "--window-unit", "celsius")
+    done = fusion("blend", rgb, fir, "-o", tmp_path / "out", *window)
+    assert done.code == 2
+    assert "--celsius-per-count" in done.err
+    assert not (tmp_path / "out").exists()

@@ -199,6 +199,10 @@ def test_time_must_rise(tmp_path: Path) -> None:
     assert kind == "stamps"
     assert "lidar: time does not rise at 1 files" in text
     assert "1/1_sync/velodyne_points/data/0000000001.bin" in text
+    path.write_text("2011-09-26 13:02:25.9\n2011-09-26 13:02:25.9\n")  # equal times do not rise
+    assert [kind for kind, _ in wrong(check(made, tmp_path))] == ["stamps"]
+    path.write_text("2001-01-01 00:00:00.1\n2001-01-01 00:00:00.2\n")  # another drive may be older
+    assert wrong(check(made, tmp_path)) == []
     path.write_text("soon\n")
     assert ("stamps", "line 1: 'soon' is no time") in [
         (kind, text.split("timestamps.txt ")[-1].split(" (")[0])
@@ -216,6 +220,18 @@ def test_a_name_without_its_stamp(tmp_path: Path) -> None:
     seen = next(seen for seen in report.roles if seen.role == "rgb")
     stems = [int(Path(frame["rgb"]).stem) for frame in tree.frames]
     assert (seen.first_ns, seen.last_ns) == (stems[0] * 10**9, stems[-1] * 10**9)
+
+
+def test_stamps_are_looked_for_where_the_keys_point(tmp_path: Path) -> None:
+    """A counter of 13 digits at the end of each name would read as a stamp."""
+    keys = {"by": "stamp", "rgb_key": "^([0-9]+)_", "fir_key": "^([0-9]+)_"}
+    made = altered(load_manifest("mine"), pairing=keys)
+    for k in range(3):
+        for role in ("rgb", "fir"):
+            write_role(tmp_path / role / f"{17 * 10**17 + k * 10**8}_{10**12 - k}.png", made, role)
+    report = check(made, tmp_path)
+    assert wrong(report) == []
+    assert {seen.first_ns for seen in report.roles} == {17 * 10**17}
 
 
 def test_roles_that_are_not_there_and_sets_that_do_not_pair_are_noted(tmp_path: Path) -> None:

@@ -93,3 +93,27 @@ def test_a_recordings_calibration_is_held_against_its_images(tmp_path: Path) -> 
     ((kind, text),) = wrong(check(made, tmp_path))
     assert kind == "calibration"
     assert "it is for fir images of 320x256, these are 32x24" in text
+
+
+def test_a_recording_that_is_cut_off_is_damaged(tmp_path: Path) -> None:
+    made = recording(tmp_path)
+    path = bag(tmp_path / "flight_1" / "a.bag", GOOD)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) - 200])  # its index is gone
+    report = check(made, tmp_path)
+    assert not report.ok
+    assert "damage" in [kind for kind, _ in wrong(report)]
+    assert all(str(path) in text for _, text in wrong(report))
+
+
+def test_a_topic_without_messages_is_wrong(tmp_path: Path) -> None:
+    made = recording(tmp_path)
+    path = tmp_path / "flight_1" / "a.bag"
+    path.parent.mkdir()
+    with Writer(path) as writer:
+        camera = writer.add_connection("/cam", "sensor_msgs/msg/Image", typestore=ROS1)
+        writer.add_connection("/thermal", "sensor_msgs/msg/Image", typestore=ROS1)
+        writer.write(camera, 10**18, image(10**18, "bgr8", 64, 48, 3))
+    ((kind, text),) = wrong(check(made, tmp_path))
+    assert kind == "topic"
+    assert "/thermal" in text

@@ -246,6 +246,7 @@ def test_real_words(shared_data):
     assert "no images and no clouds" in turtle.notes[-1]
     split = inspect(folder / "rosbag2_official/mcap/wbag")
     assert (split.facts["messages"], split.facts["files"]) == (6_074, 5)
+    assert split.facts["compression"] == "zstd (first chunk)"
 
 
 def test_pictures_that_are_none_are_faults_and_play_no_role(shared_data):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shlex
@@ -57,6 +58,21 @@ def test_the_page_escapes_and_stands_alone():
     assert parser.links
     assert all(link.startswith("data:image/") for link in parser.links)
     assert "http" not in re.sub(r"data:image/[^\"]*", "", page)
+
+
+def red_in(page: bytes) -> bool:
+    strips = re.findall(rb'alt="times of [^>]*base64,([^"]+)"', page)
+    (data,) = [base64.b64decode(found) for found in strips]
+    bgr = decoded(data).astype(int)
+    return bool((bgr[..., 2] - bgr[..., 0] > 100).any())
+
+
+def test_gaps_are_drawn_only_where_every_message_was_seen():
+    stamps = np.array([0, 1, 2, 3, 30], np.int64) * 10**8
+    for of, red in ((5, True), (500, False)):
+        times = times_of(stamps.tolist(), "log", Looked(5, of, "messages"))
+        stream = Stream("/a", "t", "image", of, times=times, stamps_ns=stamps)
+        assert red_in(page_of(Finding("p", "recording", "t", streams=(stream,)))) is red
 
 
 def test_the_text_cannot_drive_a_terminal():
@@ -127,18 +143,15 @@ def test_a_histogram_is_as_high_as_counts_are_many():
 
 
 def test_the_view_from_above_has_x_up_and_y_left():
-    xyz = np.array([[10, 0, 0]] * 50 + [[0, 10, 0]] * 50 + [[-10, -10, 0]] * 50, np.float32)
-    made = decoded(top_view("v", PointCloud(xyz)))
-    assert made is not None
-    rows, cols = np.nonzero((made != made[0, -1]).any(axis=2) & (made[..., 0] == made[..., 2]))
-    middle = len(made) // 2
-    # ahead: above the middle row; left: left of it; behind right: below and right
-    assert any((rows < middle - 50) & (abs(cols - middle) < 200))
-    places = {
-        (int(np.sign(r - rows.mean())), int(np.sign(c - cols.mean())))
-        for r, c in zip(rows, cols, strict=True)
-    }
-    assert (1, 1) in places
+    ahead, left = [[9, 0, 0]], [[0, 5, 0]]
+    xyz = np.array(ahead * 50 + left * 50 + [[-9, 0, 0]] * 50 + [[0, -9, 0]] * 50, np.float32)
+    made = decoded(top_view("v", PointCloud(xyz))).astype(int)
+    grey = (made.max(axis=2) - made.min(axis=2) == 0) & (made[..., 0] < 250)  # points; cross and bar are red
+    rows, cols = np.nonzero(grey)
+    middle = len(made) / 2
+    scale = (middle - rows.min()) / 9  # pixels a metre, by what lies ahead
+    assert any((abs(rows - middle) < 2) & (abs(cols - (middle - 5 * scale)) < 2))
+    assert not any((abs(rows - middle) < 2) & (abs(cols - (middle + 5 * scale)) < 2))
     assert top_view("v", PointCloud(np.empty((0, 3), np.float32))) is None
 
 

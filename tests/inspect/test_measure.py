@@ -28,6 +28,15 @@ def test_gaps_jumps_and_doubles_are_where_they_were_put():
     assert (times.first_ns, times.last_ns) == (int(stamps[0]), int(max(stamps)))
 
 
+def test_the_longest_gaps_come_first_and_all_are_counted():
+    steps = [10] * 20 + [40, 10, 90, 10, 50, 10, 60, 10, 70, 10, 80, 10]
+    stamps = np.cumsum([0, *steps]).tolist()
+    times = times_of(stamps, "log", Looked(len(stamps), len(stamps), "messages"))
+    assert times is not None
+    assert times.gap_count == 6
+    assert [end - begin for begin, end in times.gaps_ns] == [90, 80, 70, 60, 50]
+
+
 def test_samples_say_nothing_of_steps():
     times = times_of([0, 10**9, 5 * 10**9], "log", Looked(3, 100, "messages"))
     assert times is not None

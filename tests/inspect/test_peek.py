@@ -49,4 +49,6 @@ def test_cut_off_anywhere(count):
 
 
 def test_nothing_but_empty_segments_ends_soon():
-    assert peek(b"\xff\xd8" + b"\xff\xe0\x00\x02" * 2_000_000) is None
+    empty, frame = b"\xff\xe0\x00\x02", b"\xff\xc0\x00\x11\x08\x00\x05\x00\x07\x03"
+    assert peek(b"\xff\xd8" + empty * 100 + frame) is not None
+    assert peek(b"\xff\xd8" + empty * 100_000 + frame) is None

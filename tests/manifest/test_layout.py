@@ -321,6 +321,22 @@ def test_reasons_speak_of_clouds_and_depth_not_of_thermal(tmp_path: Path, root: 
         made.plan(root).partners("sparse")
 
 
+def test_images_that_do_not_pair_have_no_rule(tmp_path: Path) -> None:
+    made = load_manifest("flir_adas_v2_images")
+    build(made, tmp_path)
+    layout = made.plan(tmp_path)
+    assert layout["fir"].rule is None
+    assert load_manifest("msrs").pairing_rule(tmp_path).by == "stem"
+
+
+def test_mosaics_are_opened_in_colour(tmp_path: Path) -> None:
+    made = load_manifest("sthereo")
+    build(made, tmp_path)
+    layout = made.plan(tmp_path)
+    assert layout["rgb"].bayer == "bggr"
+    assert layout.open("rgb").read(0).flags == ("rgb-demosaiced",)
+
+
 # --- recordings
 
 

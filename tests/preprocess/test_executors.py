@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import pytest
+from machines import until
 from toy_work import ToyWork, chunks_of, content, run_toy, tree
 
 from fusion.errors import FusionError, InputError, OutputError, UsageError
@@ -139,17 +140,19 @@ def test_chunks_begin_in_order_and_few_at_a_time(tmp_path: Path) -> None:
 
 
 def test_when_the_caller_stops_chunks_are_given_up_at_their_next_frame(tmp_path: Path) -> None:
-    work, out = Watched(chunks_of(8, 50), delay_s=0.002), open_storage(tmp_path)
+    work, out = Watched(chunks_of(8, 50), delay_s=0.01), open_storage(tmp_path)
     claim(out, work.run_id)
     outcomes = run_local(work, out, work.chunks, 2)
     first = next(outcomes)
+    until(lambda: len(BEGUN) > 2 and UNDER_WAY)
     outcomes.close()  # type: ignore[attr-defined]
     assert isinstance(first, Committed)
     assert UNDER_WAY == []
     assert len(BEGUN) < 8
     kept = finished(out, work).done
     assert first.chunk.index in kept
-    report = run_toy(work, str(tmp_path), Route(2))
+    assert len(kept) < len(BEGUN)
+    report = run_toy(ToyWork(work.chunks), str(tmp_path), Route(2))
     assert report.kept == len(kept)
     assert tree(tmp_path) == expected(work)
 

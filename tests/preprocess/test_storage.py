@@ -120,6 +120,17 @@ def test_a_store_that_does_not_answer_is_one_line(s3_endpoint: str) -> None:
     assert store.size("a") is None
 
 
+def test_what_another_machine_put_is_seen(s3_endpoint: str) -> None:
+    import s3fs
+
+    store, other = open_storage("s3://output/two"), s3fs.S3FileSystem(skip_instance_cache=True)
+    for count in range(2):
+        assert len(list(store.names(""))) == len(store.sizes("f")) == count
+        assert store.size(f"f/{count}") is None
+        other.pipe_file(f"output/two/f/{count}", b"1")
+        assert store.size(f"f/{count}") == 1
+
+
 def test_the_endpoint_is_fsspecs_own_configuration(s3_endpoint: str) -> None:
     code = "from fusion.storage import open_storage; open_storage('s3://output/by-env').write('a', b'1')"
     environment = {name: value for name, value in os.environ.items() if name != "AWS_ENDPOINT_URL"}
@@ -175,13 +186,18 @@ def test_nothing_but_the_file_is_left(tmp_path: Path) -> None:
 
 
 def test_a_reader_never_sees_half_a_file(tmp_path: Path) -> None:
+    """Even when two write it: a chunk may be done a second time while its first worker is only slow."""
     store = open_storage(tmp_path)
-    sides = [b"a" * 300_000, b"b" * 200_000]
+    sides = [b"a" * 3_000_000, b"b" * 2_000_000]
     store.write("f", sides[0])
-    with ThreadPoolExecutor(1) as pool:
-        writing = pool.submit(lambda: [store.write("f", sides[turn % 2]) for turn in range(100)])
-        while not writing.done():
+    with ThreadPoolExecutor(2) as pool:
+        writing = [
+            pool.submit(lambda data=data: [store.write("f", data) for _ in range(40)]) for data in sides
+        ]
+        while not all(each.done() for each in writing):
             assert store.read("f") in sides
+        assert [each.exception() for each in writing] == [None, None]
+    assert store.names("") == ["f"]
 
 
 def test_one_run_at_a_time(tmp_path: Path) -> None:

@@ -46,6 +46,14 @@ def test_offset_and_drift_of_a_long_recording(rates_hz: tuple[int, int], clock: 
     assert found.confidence > 0.9
 
 
+def test_a_drift_that_blurs_the_whole_is_found_as_well() -> None:
+    path, clock = wobble(12), Clock(0.25, 280e-6)  # a third of a second in the end
+    rgb, fir = motion(path, times(10, 1200), Clock()), motion(path, times(12, 1200), clock)
+    found = estimate_clock(rgb, fir, time_constant_s=0)
+    assert found.score > 0.9
+    assert errors_ms(found, clock, fir)[1] < 2.0
+
+
 def test_the_sign_is_that_of_a_rig_and_a_rough_offset_may_be_far() -> None:
     path, far = wobble(5), Clock(5000.25)
     rgb, fir = motion(path, times(20, 30), Clock()), motion(path, times(25, 30), far)
@@ -146,9 +154,13 @@ def test_from_pictures_with_freezes_and_changing_exposure() -> None:
 def test_shifts_are_those_of_the_pictures() -> None:
     path = wobble(4, 5.0)
     true_s = times(20, 2.5)
-    found = metered(Clock().stamps(true_s), list(pictures(path, true_s, 3, thermal=True))).shift_px
+    frames = list(pictures(path, true_s, 3, thermal=True))
+    other = list(pictures(wobble(40, 9.0), true_s, 30, thermal=True))
+    for pixels, drawn in zip(frames, other, strict=True):
+        pixels[:48, :64] = drawn[:48, :64]  # something moves by itself in a quarter of the picture
+    found = metered(Clock().stamps(true_s), frames).shift_px
     # the scene moves against the camera
-    assert float(np.median(np.abs(found + np.diff(path(true_s), axis=0)))) < 0.1
+    assert float(np.median(np.abs(found + np.diff(path(true_s), axis=0)))) < 0.15
 
 
 def test_a_meter_skips_what_is_no_new_picture() -> None:

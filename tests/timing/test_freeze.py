@@ -67,7 +67,7 @@ def test_a_flight_that_comes_to_rest_is_not_frozen() -> None:
     assert not frozen(steps_of([*frames, *rest, *frames])).any()  # type: ignore[list-item]
 
 
-@pytest.mark.parametrize("share", [0.3, 0.9])
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.98])
 def test_clipped_pictures_are_judged_by_what_is_left(share: float) -> None:
     frames = live(6, 5, moving=False)
     level = np.quantile(np.stack(frames[:5]), share)
