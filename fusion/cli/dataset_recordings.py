@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from fusion.cli.dataset_checks import RoleSeen
 from fusion.errors import FusionError
-from fusion.inspect.roles import Seen
 from fusion.messages import reader_of
 from fusion.messages.base import CameraInfo, CompressedImage, Message, Points, RawImage
+from fusion.messages.roles import Seen
 from fusion.recordings import open_recording
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 from cyclopts import App, CycloptsError, Parameter
 
+from fusion.cli.inspect import INSPECT_EXAMPLES, INSPECT_HELP
 from fusion.errors import FusionError
 
 BLEND_HELP = (
@@ -135,6 +136,9 @@ app = App(
     suppress_keyboard_interrupt=False,  # ours says how to go on
 )
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
+app.command(
+    "fusion.cli.inspect:inspect", name="inspect", help=INSPECT_HELP, help_epilogue=INSPECT_EXAMPLES
+)
 app.command(
     "fusion.cli.preprocess:preprocess",
     name="preprocess",

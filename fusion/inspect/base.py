@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
 
-from fusion.inspect.roles import Roles
+from fusion.messages.roles import Roles
 
 FORMAT = "fusion-inspect/1"
 QUICK_BYTES = 64 * 2**20  # a recording up to this size is read whole even without --full

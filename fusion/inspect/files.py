@@ -16,10 +16,10 @@ from fusion.errors import FrameError, FusionError
 from fusion.inspect.base import QUICK_BYTES, QUICK_ITEMS, Asked, Looked, Picture, Stream, Times
 from fusion.inspect.image import what_of
 from fusion.inspect.measure import PixelTally, freezes_said, points_of, spread, times_of
-from fusion.inspect.peek import word_of
 from fusion.inspect.pictures import histogram, thumbnail, top_view
-from fusion.inspect.roles import Seen
 from fusion.messages.base import CompressedImage, Points
+from fusion.messages.peek import word_of
+from fusion.messages.roles import Seen
 from fusion.pairing.times import stamps_of
 from fusion.radiometric import read_flir
 from fusion.radiometric.flir import HEAD_BYTES, glance, why_no_counts

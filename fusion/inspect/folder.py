@@ -12,7 +12,7 @@ from fusion.errors import FusionError, InputError
 from fusion.inspect.base import FALLBACK, Asked, Finding, InspectKind, Step, Stream, steps_of
 from fusion.inspect.files import Sampled, cloud_stream, image_stream
 from fusion.inspect.rigs import format_of
-from fusion.inspect.roles import Roles, roles_of
+from fusion.messages.roles import Roles, roles_of
 from fusion.rig import FORMAT as RIG_FORMAT
 from fusion.sources.folders import IMAGE_SUFFIXES, list_folder
 

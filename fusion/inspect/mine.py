@@ -8,7 +8,7 @@ from typing import Any
 from fusion.errors import FusionError
 from fusion.inspect.base import Asked, Finding, InspectKind, steps_of
 from fusion.inspect.folder import look_at_folder, streams_of
-from fusion.inspect.roles import roles_of
+from fusion.messages.roles import roles_of
 
 _SENSORS = ("rgb", "fir", "lidar")
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion.inspect.base import FORMAT, Finding, Looked, Stream, Times
-from fusion.inspect.roles import Guess, Roles
 from fusion.inspect.text import command_of
+from fusion.messages.roles import Guess, Roles
 
 
 def json_of(finding: Finding) -> str:

@@ -18,9 +18,9 @@ from fusion.inspect.base import (
 )
 from fusion.inspect.compression import compression_of
 from fusion.inspect.measure import spread
-from fusion.inspect.roles import Roles, roles_of
 from fusion.inspect.topics import TopicLook
 from fusion.messages.base import Role
+from fusion.messages.roles import Roles, roles_of
 from fusion.recordings import is_recording, open_recording
 from fusion.recordings.base import Recording, Topic
 

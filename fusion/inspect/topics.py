@@ -13,7 +13,6 @@ from fusion.frames import Image, PointCloud
 from fusion.inspect.base import Looked, Picture, Stream
 from fusion.inspect.measure import PixelTally, freezes_said, points_of, times_of
 from fusion.inspect.pictures import histogram, thumbnail, top_view
-from fusion.inspect.roles import Seen, is_colour
 from fusion.messages import reader_of
 from fusion.messages.base import (
     CameraInfo,
@@ -26,6 +25,7 @@ from fusion.messages.base import (
 )
 from fusion.messages.clouds import cloud_of_points
 from fusion.messages.images import image_of
+from fusion.messages.roles import Seen, is_colour
 from fusion.recordings.base import Packet, Topic
 from fusion.timing.freeze import FreezeFinder, Step
 

@@ -21,10 +21,10 @@ from fusion.storage import Storage
 class Made:
     """One frame with all that was made of it; every part is on the RGB grid but the cloud of `frames`.
 
-    `stem` names its files and is unique in the run. `fir_counts` is H x W uint16, thermal as it was measured, 0 where
-    it does not reach. `depth` is there where a cloud was. `encoded` holds the pictures as they are stored, made
-    once for all outputs: ``fused`` (PNG or JPEG), ``mask``, ``depth`` (uint16 PNG, metres x 256), ``support``, ``fir``
-    (uint16 PNG).
+    `stem` names its files and is unique in the run. `fir_counts` is H x W uint16, thermal as it was
+    measured, 0 where it does not reach. `depth` is there where a cloud was. `encoded` holds the pictures as
+    they are stored, made once for all outputs: ``fused`` (PNG or JPEG), ``mask``, ``depth`` (uint16 PNG,
+    metres x 256), ``support``, ``fir`` (uint16 PNG).
     """
 
     stem: str
@@ -37,8 +37,8 @@ class Made:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What outputs know of the run. `rig` is None where nobody calibrated; `camera` is the one that depth was made
-    for, `rate_hz` the frames a second of the leading stream.
+    """What outputs know of the run. `rig` is None where nobody calibrated; `camera` is the one that depth
+    was made for, `rate_hz` the frames a second of the leading stream.
     """
 
     rig: Rig | None
@@ -68,7 +68,8 @@ class Output(Protocol):
     def open(self, chunk: Chunk, out: Storage) -> ChunkOutput: ...
 
     def finish(self, chunks: Sequence[Chunk], out: Storage) -> Sequence[str]:
-        """After all chunks: join what must be one file, by rename; idempotent. The names for the closing words."""
+        """After all chunks: join what must be one file, by rename; idempotent. The names for the closing
+        words."""
         ...
 
 

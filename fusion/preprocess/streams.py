@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from fusion.errors import InputError, UsageError
-from fusion.inspect.roles import Roles, Seen, roles_of
 from fusion.messages import reader_of
 from fusion.messages.base import CompressedImage, Points, RawImage
+from fusion.messages.roles import Roles, Seen, roles_of
 from fusion.preprocess.config import StreamsConfig
 from fusion.preprocess.recorded import Streams
 from fusion.recordings.base import Recording, Topic

@@ -1,4 +1,5 @@
-"""What every recording offers: topics, and timed bytes in the order of their log times; the table of forms."""
+"""What every recording offers: topics, and timed bytes in the order of log times; the table of forms."""
+forms."""
 
 from __future__ import annotations
 
@@ -12,8 +13,9 @@ class Schema:
     """How a message is laid out, as the recording itself says it.
 
     `name` is in ROS 2's form (``sensor_msgs/msg/Image``; ROS 1's ``sensor_msgs/Image`` is brought to it),
-    or as it stands for protobuf and JSON (``foxglove.RawImage``). `form` is MCAP's word for what `data` holds:
-    ``ros1msg``, ``ros2msg``, ``ros2idl``, ``protobuf`` (a FileDescriptorSet), ``jsonschema``, or "" for none.
+    or as it stands for protobuf and JSON (``foxglove.RawImage``). `form` is MCAP's word for what `data`
+    holds: ``ros1msg``, ``ros2msg``, ``ros2idl``, ``protobuf`` (a FileDescriptorSet), ``jsonschema``, or ""
+    for none.
     """
 
     name: str
@@ -25,8 +27,8 @@ class Schema:
 class Topic:
     """One topic with one type; connections that agree in both are one, and one name may have two types.
 
-    `encoding` is MCAP's word for the bytes of a message: ``ros1``, ``cdr``, ``protobuf``, ``json``, or what the
-    file says. `count` is how many messages the file's own index claims, None where it has none.
+    `encoding` is MCAP's word for the bytes of a message: ``ros1``, ``cdr``, ``protobuf``, ``json``, or what
+    the file says. `count` is how many messages the file's own index claims, None where it has none.
     """
 
     name: str
@@ -47,8 +49,8 @@ class Recording(Protocol):
     """An open recording. `packets` may be called from several threads; each call reads on its own.
 
     `span_ns` is [first, last + 1) of the log times, None where there is no message; `faults` says in one line
-    each what is damaged, with its place in the file, and how much of it was read nevertheless: it may grow while
-    packets are read. `files` are the files that it consists of.
+    each what is damaged, with its place in the file, and how much of it was read nevertheless: it may grow
+    while packets are read. `files` are the files that it consists of.
     """
 
     name: str

@@ -10,7 +10,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from fusion.errors import FrameError
+from fusion.errors import FrameError, InputError
 from fusion.frames import FusedFrame
 
 
@@ -99,12 +99,19 @@ def to_csv(rows: Iterable[RowT], kind: type[RowT], header: bool = True) -> str:
 
 
 def read_rows(path: Path, kind: type[RowT], *, header: bool = True) -> list[RowT]:
-    """The whole rows of a CSV. A last line that a killed run left half written does not count."""
+    """The whole rows of a CSV. A last line that a killed run left half written does not count.
+
+    Raises `InputError` where it is no CSV.
+    """
     try:
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
     except FileNotFoundError:
         return []
     whole = text[: text.rfind("\n") + 1]
-    cells = list(csv.reader(io.StringIO(whole, newline="")))
+    try:
+        cells = list(csv.reader(io.StringIO(whole, newline="")))
+    except csv.Error as error:
+        hint = "it is damaged: delete it, or choose another place for the output"
+        raise InputError(f"is no index: {error}", where=path, hint=hint) from None
     width = len(columns_of(kind))
     return [kind(*row) for row in cells[1 if header else 0 :] if len(row) == width]

@@ -13,7 +13,7 @@ from fusion.errors import InputError
 from fusion.frames import PointCloud
 from fusion.geometry import PinholeCamera
 from fusion.inspect import inspect
-from fusion.inspect.roles import camera_of
+from fusion.messages.roles import camera_of
 from fusion.rig import Rig, save_rig
 from tests.inspect.recorded import chosen, streams
 

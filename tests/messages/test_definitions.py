@@ -195,3 +195,11 @@ def test_any_text_is_a_definition_or_an_input_error(form: str, words: list[str])
     for text in ("".join(words), " ".join(words)):
         with suppress(InputError):
             reader_of(Topic("/a", Schema("t/msg/T", form, text.encode()), "cdr"))
+
+
+def test_the_first_text_is_the_type_itself() -> None:
+    found = parse("ros2msg", "a/msg/A", b"uint8 x\ntime t\n===\nMSG: a/A\nuint16 y\n===\nMSG: a/B\nint8 z\n")
+    assert [field.name for field in found["a/A"]] == ["x", "t"]
+    assert [field.name for field in found["a/B"]] == ["z"]
+    assert [field.type for field in found["time"]] == ["int32", "uint32"]  # ROS 2's seconds have a sign
+    assert [field.type for field in parse("ros1msg", "a/A", b"")["time"]] == ["uint32", "uint32"]

@@ -1,4 +1,4 @@
-"""Plans against rosbags' serialiser where alignment decides: what lies behind texts and arrays of any length."""
+"""Plans against rosbags' serialiser where alignment decides: behind texts and arrays of any length."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusion.inspect.roles import Seen, camera_of, guess_roles, roles_of, words_of
 from fusion.messages.base import CameraInfo, CompressedImage, Points, RawImage, Transforms
+from fusion.messages.roles import Seen, camera_of, guess_roles, roles_of, words_of
 from fusion.recordings.base import Schema, Topic
 
 

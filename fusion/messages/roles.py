@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from fusion.inspect.peek import peek
 from fusion.messages.base import CameraInfo, CompressedImage, Message, Points, RawImage, Role, Transforms
+from fusion.messages.peek import peek
 from fusion.recordings.base import Topic
 
 CAMERA_ROLES: tuple[Role, ...] = ("rgb", "fir", "depth")

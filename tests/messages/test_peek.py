@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusion.inspect.peek import peek
+from fusion.messages.peek import peek
 
 
 def encoded(form, pixels):
