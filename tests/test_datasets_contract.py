@@ -105,6 +105,8 @@ def test_blend_gets_the_pairs_with_their_pixels(name: str, tmp_path: Path) -> No
     assert not pairs.pairing.unmatched
     frames = pairs.read(0)
     assert frames.bgr.shape[2] == 3
+    mosaic = manifest.rgb is not None and manifest.rgb.bayer is not None
+    assert ("rgb-demosaiced" in frames.rgb.flags) is mosaic
     assert frames.counts.dtype == (np.uint16 if manifest.checks.fir_bits == 16 else np.uint8)
     fits = manifest.differences(rgb=frames.rgb, fir=frames.fir)
     assert fits == []

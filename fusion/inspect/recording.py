@@ -29,6 +29,7 @@ PACKETS = 2_000  # messages that are read there at most
 LINKS = 200  # transforms that are read without --full
 FAR_S = 60.0  # from a stamp to the log: more is no delay
 _OPTIONS: dict[Role, str] = {"rgb": "--rgb", "fir": "--fir", "lidar": "--lidar"}
+_NEEDED: dict[Role, str] = {"rgb": "RGB", "fir": "thermal"}
 
 
 def look_at_recording(path: str | Path, asked: Asked) -> Finding:
@@ -154,21 +155,21 @@ def _notes(roles: Roles, looks: list[TopicLook], messages: int | None) -> list[s
         for look in looks
         if look.kind is not None and abs(seconds := look.delay_s()) > FAR_S
     ]
-    if not set(_OPTIONS) & roles.chosen.keys():
-        notes.append("nothing here can be fused: no images and no clouds that are read")
+    missing = [words for role, words in _NEEDED.items() if role not in roles.chosen]
+    if missing:
+        notes.append(f"nothing here can be fused: no topic can be {' and none '.join(missing)}")
     return notes
 
 
 def _steps(path: str, roles: Roles) -> tuple[Step, ...]:
+    if not _NEEDED.keys() <= roles.chosen.keys():
+        return ()
     words: list[object] = ["fusion", "preprocess", path]
     for role, option in _OPTIONS.items():
         if role in roles.chosen:
             words += [option, roles.chosen[role][0].name]
-    if len(words) == 3:
-        return ()
-    more = " (--rig RIG: how its sensors stand)" if len(words) > 5 else ""
     return steps_of(
-        ([*words, "-o", "OUT"], f"to fused frames{more}" if "fir" in roles.chosen else f"its frames{more}")
+        ([*words, "-o", "OUT"], "to fused frames (--rig RIG: how its sensors stand)"),
     )
 
 

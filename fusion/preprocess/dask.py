@@ -38,6 +38,7 @@ Client = Any  # distributed's, whose types do not tell its blocking from its asy
 Future = Any
 
 GOES_ON = "the same command goes on where this one stopped"
+DEADLY = "every worker that tried it died (out of memory? the worker's log says)"
 LOOK_EVERY_S = 1.0  # how often the scheduler is looked after while no chunk ends
 CONNECT_S = 30.0  # for a scheduler to answer
 SOON_S = 5.0  # for the first worker to join before anything is said
@@ -60,18 +61,29 @@ def run_dask(
     here.
 
     What became of each chunk, as they end. The chunk of a worker that dies goes to another one; a chunk that
-    takes several workers with it is failed. `wait_s` is how long to wait for the scheduler and its first
-    worker; when all workers are gone later, `say` says so and the campaign waits for new ones. Raises
-    `InputError` when the scheduler does not answer or is gone, `UsageError` when a worker has another fusion
-    or none, when it sees another output, or when the extra is not installed.
+    takes several workers with it, at last when it alone is done, is failed. `wait_s` is how long to wait for
+    the scheduler and its first worker; when all workers are gone later, `say` says so and the campaign waits
+    for new ones. Raises `InputError` when the scheduler does not answer or is gone, `UsageError` when a
+    worker has another fusion or none, when it sees another output, or when the extra is not installed.
     """
     with _quiet(), _connected(scheduler, workers, wait_s, say) as client:
         _refuse_other_versions(client)
         tally = Tally(work.chunks, todo, progress)
-        for chunk, future in _ended(client, Handed(work, out, version("fusionprep")), todo, say):
+        hand = Hand(client, Handed(work, out, version("fusionprep")), say)
+        suspects: list[Chunk] = []
+        for chunk, future in hand.out(todo):
             outcome = _outcome(client, chunk, future)
+            if outcome is None:
+                suspects.append(chunk)
+                continue
             tally.finish(chunk)
             yield outcome
+        # A worker that died may have had other chunks waiting: who took it along shows when each is alone.
+        for suspect in suspects:
+            for chunk, future in hand.out([suspect]):
+                outcome = _outcome(client, chunk, future) or Failed(chunk, DEADLY)
+                tally.finish(chunk)
+                yield outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,26 +121,33 @@ class Handed:
 # --- chunks out and back
 
 
-def _ended(client: Client, handed: Handed, todo: Sequence[Chunk], say: Say) -> Iterator[tuple[Chunk, Future]]:
-    """Hand the chunks out in order; each with its future when that has ended in whatever way."""
-    position = {chunk.index: place for place, chunk in enumerate(handed.work.chunks)}
-    shared = client.submit(pickle.loads, _pickled(handed), pure=False)
-    waiting, under_way, ended = iter(todo), {}, SimpleQueue[Any]()
-    room = Room(client, say)
-    while True:
-        for chunk in islice(waiting, max(0, room() - len(under_way))):
-            future = client.submit(operator.call, shared, position[chunk.index], pure=False)
-            under_way[future.key] = (chunk, future)
-            future.add_done_callback(ended.put)
-        if not under_way:
-            return
-        try:
-            key = ended.get(timeout=LOOK_EVERY_S).key
-        except Empty:
-            if client.status != "running":
-                raise _gone(client) from None
-            continue
-        yield under_way.pop(key)
+class Hand:
+    """Hands chunks out and takes back what became of them."""
+
+    def __init__(self, client: Client, handed: Handed, say: Say) -> None:
+        self._client = client
+        self._position = {chunk.index: place for place, chunk in enumerate(handed.work.chunks)}
+        self._shared = client.submit(pickle.loads, _pickled(handed), pure=False)
+        self._room = Room(client, say)
+
+    def out(self, todo: Sequence[Chunk]) -> Iterator[tuple[Chunk, Future]]:
+        """Hand `todo` out in order; each with its future when that has ended in whatever way."""
+        waiting, under_way, ended = iter(todo), dict[str, tuple[Chunk, Future]](), SimpleQueue[Any]()
+        while True:
+            for chunk in islice(waiting, max(0, self._room() - len(under_way))):
+                place = self._position[chunk.index]
+                future = self._client.submit(operator.call, self._shared, place, pure=False)
+                under_way[future.key] = (chunk, future)
+                future.add_done_callback(ended.put)
+            if not under_way:
+                return
+            try:
+                key = ended.get(timeout=LOOK_EVERY_S).key
+            except Empty:
+                if self._client.status != "running":
+                    raise _gone(self._client) from None
+                continue
+            yield under_way.pop(key)
 
 
 class Room:
@@ -152,7 +171,8 @@ class Room:
         return max(1, self._threads)
 
 
-def _outcome(client: Client, chunk: Chunk, future: Future) -> Committed | Failed:
+def _outcome(client: Client, chunk: Chunk, future: Future) -> Committed | Failed | None:
+    """What became of a chunk; None where the workers that had it died."""
     from distributed import CancelledError, KilledWorker
 
     try:
@@ -161,9 +181,8 @@ def _outcome(client: Client, chunk: Chunk, future: Future) -> Committed | Failed
         raise _gone(client) from None
     except UsageError:
         raise
-    except KilledWorker as error:
-        times = error.allowed_failures + 1
-        return Failed(chunk, f"took its worker with it {times} times (out of memory? the worker's log says)")
+    except KilledWorker:
+        return None
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] == "fusion":
             raise _without_fusion("a worker") from None

@@ -1,5 +1,4 @@
 """What every recording offers: topics, and timed bytes in the order of log times; the table of forms."""
-forms."""
 
 from __future__ import annotations
 

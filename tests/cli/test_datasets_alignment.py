@@ -58,6 +58,8 @@ def test_a_claim_of_registration_is_held_against_the_scene(dx: int, verdict: str
     (said,) = [f for f in report.findings if f.kind == "alignment"]
     assert verdict in said.text
     assert report.ok is (dx == 0)
+    unclaimed = load_manifest("roadscene").model_copy(update={"registered": False})
+    assert check(unclaimed, tmp_path, alignment=True).ok
     if dx:  # the nearest step
         assert "moved by -6 % of the width, +0 % down" in said.text
 

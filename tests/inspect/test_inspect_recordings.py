@@ -243,7 +243,8 @@ def test_real_words(shared_data):
     turtle = inspect(folder / "example-bz2.bag")
     assert turtle.facts["messages"] == 8_647
     assert turtle.facts["compression"] == "bz2 (first chunk)"
-    assert "no images and no clouds" in turtle.notes[-1]
+    assert "no topic can be RGB and none thermal" in turtle.notes[-1]
+    assert not any("preprocess" in step.words for step in turtle.steps)
     split = inspect(folder / "rosbag2_official/mcap/wbag")
     assert (split.facts["messages"], split.facts["files"]) == (6_074, 5)
     assert split.facts["compression"] == "zstd (first chunk)"

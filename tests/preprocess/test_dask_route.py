@@ -55,7 +55,7 @@ def test_a_cluster_made_here(
     reasons = {one.chunk.index: one.reason for one in report.failed}
     assert set(reasons) == {3, 5}
     assert reasons[3] == "toy.bag: no such message"
-    assert reasons[5].startswith("took its worker with it 2 times")
+    assert reasons[5].startswith("every worker that tried it died")
     assert (report.done, report.rows) == (6, 18)
     assert (told[0], told[-1]) == ((0, 24, 0, 8), (24, 24, 8, 8))
     assert open_storage(tmp_path).size("died/000001") == 0
