@@ -6,7 +6,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -20,10 +20,18 @@ from fusion.files import replace_file
 from fusion.frames import FrameSet
 from fusion.pairing import PairingRule
 from fusion.registration import Registration, write_homography
-from fusion.sync import Pairs, open_pairs
+from fusion.sync import open_pairs
 
 Model = Literal["auto", "similarity", "affine", "homography"]
 FRAMES = 8  # pairs that are pooled
+
+
+class Frames(Protocol):
+    """What can be aligned: any number of frames, read by their number."""
+
+    def __len__(self) -> int: ...
+
+    def read(self, index: int) -> FrameSet: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +71,7 @@ def run_align(
 
 
 def aligned(
-    pairs: Pairs,
+    pairs: Frames,
     model: Model = "auto",
     matcher: str = "channels",
     frames: int = FRAMES,
@@ -96,7 +104,7 @@ def _say(step: str) -> None:
         print(f"  {step}", file=sys.stderr, flush=True)
 
 
-def _spread(pairs: Pairs, count: int) -> list[FrameSet]:
+def _spread(pairs: Frames, count: int) -> list[FrameSet]:
     """Evenly spread pairs that can be read. Raises `InputError` where none can."""
     chosen, broken = [], []
     for index in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).astype(int)):

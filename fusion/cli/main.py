@@ -136,9 +136,7 @@ app = App(
     suppress_keyboard_interrupt=False,  # ours says how to go on
 )
 app.command("fusion.cli.blend:blend", name="blend", help=BLEND_HELP, help_epilogue=BLEND_EXAMPLES)
-app.command(
-    "fusion.cli.inspect:inspect", name="inspect", help=INSPECT_HELP, help_epilogue=INSPECT_EXAMPLES
-)
+app.command("fusion.cli.inspect:inspect", name="inspect", help=INSPECT_HELP, help_epilogue=INSPECT_EXAMPLES)
 app.command(
     "fusion.cli.preprocess:preprocess",
     name="preprocess",
@@ -146,12 +144,17 @@ app.command(
     help_epilogue=PREPROCESS_EXAMPLES,
 )
 app.command("fusion.cli.depth:depth", name="depth", help=DEPTH_HELP, help_epilogue=DEPTH_EXAMPLES)
-datasets = App(name="datasets", help="List and show the data sets whose layout is known.")
+datasets = App(name="datasets", help="List, show and check the data sets whose layout is known.")
 datasets.command("fusion.cli.datasets:list_datasets", name="list", help="List the known data sets.")
 datasets.command(
     "fusion.cli.datasets:show_dataset",
     name="show",
     help="Show one data set: layout, licence, where to get it.",
+)
+datasets.command(
+    "fusion.cli.datasets:check_dataset",
+    name="check",
+    help="Hold a data set's files against what is known of it.",
 )
 app.command(datasets)
 simulate = App(name="simulate", help="Make sample data with the truth beside it.")

@@ -76,6 +76,7 @@ def preprocess(
     fir_colour: options.FirColour = None,
     homography: options.Homography = None,
     points: options.Points = None,
+    align: options.Align = None,
     rig: options.Rig = None,
     warp: options.Warp = None,
     distance: options.Distance = None,

@@ -8,13 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fusion.cli.aligning import FRAMES, aligned
 from fusion.cli.blending import PLACES, rig_of
 from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
-from fusion.errors import InputError, UsageError
-from fusion.manifest import Layout, Manifest, load_manifest
+from fusion.errors import FrameError, InputError, UsageError
+from fusion.frames import FrameSet
+from fusion.manifest import Layout, load_manifest
 from fusion.preprocess.campaign import Pace, Route
 from fusion.preprocess.config import PreprocessConfig, load_preprocess_config
-from fusion.preprocess.footage import Footage, SetFootage
+from fusion.preprocess.footage import Footage, Moment, SetFootage
 from fusion.preprocess.local import Progress, no_progress
 from fusion.preprocess.recorded import RecordedFootage
 from fusion.preprocess.run import preprocess
@@ -44,7 +46,7 @@ OWN_PLACES = {
     "to": ("outputs", "kinds"),
     "chunk_s": ("chunk_s",),
 }
-NOT_HERE = {"pair", "rgb_key", "fir_key", "pair_map", "tolerance_ms", "align", "depth"}
+NOT_HERE = {"pair", "rgb_key", "fir_key", "pair_map", "tolerance_ms", "depth"}
 
 
 def settings_of(config: Path | None, given: Mapping[str, Any]) -> PreprocessConfig:
@@ -100,7 +102,10 @@ def _campaign(
     quiet: bool,
 ) -> Exception | None:
     config = settled(config, footage.has_lidar)
-    work = PreprocessWork(footage, config, make_plan(footage, config), rig)
+    registration = None
+    if config.fuse.warp.align:
+        registration = aligned(_Here(footage, config.chunk_s), quiet=quiet).registration
+    work = PreprocessWork(footage, config, make_plan(footage, config, registration), rig)
     if not quiet or dry_run:
         print("\n".join(campaign_plan(work, guessed)), flush=True)
     if dry_run or out is None:
@@ -117,6 +122,25 @@ def _campaign(
         stem, reason = result.skipped[0]
         problem = InputError(f"no frame could be made; the first, {stem!r}: {reason}")
     return problem
+
+
+class _Here:
+    """A frame from each of a few places in the footage: what an alignment looks at."""
+
+    def __init__(self, footage: Footage, chunk_s: float) -> None:
+        chunks = footage.chunks(chunk_s)
+        if len(chunks) < FRAMES:
+            chunks = footage.chunks(max(0.1, chunk_s * len(chunks) / FRAMES))
+        self._footage, self._chunks = footage, chunks
+
+    def __len__(self) -> int:
+        return len(self._chunks)
+
+    def read(self, index: int) -> FrameSet:
+        for moment in self._footage.moments(self._chunks[index]):
+            if isinstance(moment, Moment):
+                return moment.images()
+        raise FrameError("no frame there", where=f"{self._footage.name}, chunk {self._chunks[index].name}")
 
 
 Part = tuple[str, PreprocessConfig, Footage, "Rig | None", list[str]]
@@ -138,7 +162,8 @@ def _parts(
     layout = manifest.plan(root)
     config = _as_the_set_says(config, layout)
     rig = rig_of(config.fuse)
-    _check_registered(config, manifest)
+    warp = config.fuse.warp
+    manifest.refuse_unfit(registration=bool(warp.rig or warp.homography or warp.points or warp.align))
     if layout.recording is None:
         offset_ns, said = _fir_offset_ns(config, rig), list[str]()
         colour, keep = config.fuse.thermal.fir_colour, config.streams.keep_frozen
@@ -195,24 +220,13 @@ def _as_the_set_says(config: PreprocessConfig, layout: Layout) -> PreprocessConf
             update={k: v for k, v in known.items() if k not in given and v is not None}
         )
     warp = config.fuse.warp
-    registered = warp.rig or warp.homography or warp.points
+    registered = warp.rig or warp.homography or warp.points or warp.align
     files = layout.calibration.readable() if layout.calibration is not None else ()
     settings = config.model_dump(exclude_unset=True, exclude_none=True)
     settings["streams"] = streams.model_dump(exclude_none=True)
     if not registered and len(files) == 1 and not layout.manifest.registered:
         settings.setdefault("fuse", {}).setdefault("warp", {})["rig"] = str(files[0])
     return PreprocessConfig.of(settings)
-
-
-def _check_registered(config: PreprocessConfig, manifest: Manifest) -> None:
-    warp = config.fuse.warp
-    if manifest.registered or warp.rig or warp.homography or warp.points:
-        return
-    raise InputError(
-        "its thermal images are not registered to its RGB images: as they are, they do not fit",
-        where=f"data set {manifest.name}",
-        hint="give --rig FILE, --homography FILE or --points CSV (fusion calibrate align makes a homography)",
-    )
 
 
 def _fir_offset_ns(config: PreprocessConfig, rig: Rig | None) -> int:

@@ -156,9 +156,12 @@ class RecordedFootage:
 
     def chunks(self, chunk_s: float) -> list[Chunk]:
         step = round(1e9 * chunk_s)
-        frames = max(1, round(chunk_s * self.rate_hz))
         begins = range(self.begin_ns, self.end_ns, step)
-        return [Chunk(k, begin, min(begin + step, self.end_ns), frames) for k, begin in enumerate(begins)]
+        ends = [min(begin + step, self.end_ns) for begin in begins]
+        return [
+            Chunk(k, begin, end, max(1, round((end - begin) * 1e-9 * self.rate_hz)))
+            for k, (begin, end) in enumerate(zip(begins, ends, strict=True))
+        ]
 
     def fir_at(self, position: int) -> Image:
         start = self.begin_ns + position * self.paces["fir"].interval_ns

@@ -108,7 +108,7 @@ class PreprocessWork:
             return self._fuser
 
     def _depth_value(self) -> Value | None:
-        lane = self._lane() if self.onto_rgb else None
+        lane = self.lane() if self.onto_rgb else None
         return None if lane is None else lane.value
 
     @property
@@ -116,7 +116,7 @@ class PreprocessWork:
         """Whether depth is made for the RGB camera of the rig; else for a virtual camera."""
         return self.rig is not None
 
-    def _lane(self) -> DepthLane | None:
+    def lane(self) -> DepthLane | None:
         if not self.footage.has_lidar:
             return None
         depth = self.config.depth
@@ -130,7 +130,7 @@ class PreprocessWork:
         fuser = self.fuser()
         with self._lock:
             if self._ready is None:
-                lane = self._lane()
+                lane = self.lane()
                 maker = FrameMaker(self.config, fuser, self.plan.windows, lane, self.onto_rgb)
                 output = self.config.fuse.output
                 camera = None if lane is None else lane.camera
