@@ -10,7 +10,7 @@ help:
 	@echo "make test       the tests"
 	@echo "make check      all that CI runs: lint, types, tests, notebooks, wheel"
 	@echo "make bench      the benchmarks; writes docs/benchmarks.md"
-	@echo "make accuracy   errors of depth and calibration; writes its tables into docs/"
+	@echo "make accuracy   errors of depth, calibration and timing; writes its tables into docs/"
 	@echo "make notebooks  run the notebooks"
 	@echo "make clean      remove environments and products"
 

@@ -1,6 +1,6 @@
 """`python benchmarks/accuracy.py [--write docs] [--only PAGE] [--data FOLDER]`: results against truth.
 
-The tables replace what stands between two marks in docs/depth.md and docs/calibration.md. Real data is
+The tables replace what stands between two marks in docs/depth.md, docs/calibration.md and docs/timing.md. Real data is
 looked for in FOLDER (by default beside the checkout); what is not there is said to be not measured. The
 simulated mine and drawn sessions are always measured.
 """
@@ -17,6 +17,7 @@ import accuracy_calib
 import accuracy_kitti
 import accuracy_map
 import accuracy_mine
+import accuracy_timing
 import accuracy_warp
 
 BEGIN, END = "<!-- begin: made by make accuracy -->", "<!-- end: made by make accuracy -->"
@@ -32,7 +33,11 @@ def calibration(data: Path) -> str:
     return "\n\n".join(parts)
 
 
-PAGES: dict[str, Callable[[Path], str]] = {"depth": depth, "calibration": calibration}
+def timing(data: Path) -> str:  # noqa: ARG001 - of simulated flights alone
+    return accuracy_timing.markdown()
+
+
+PAGES: dict[str, Callable[[Path], str]] = {"depth": depth, "calibration": calibration, "timing": timing}
 
 
 def main() -> None:

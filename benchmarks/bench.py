@@ -22,6 +22,8 @@ import inprocess
 import lidar
 import memory
 import mine
+import preprocess
+import recordings
 import warp
 from content import FIR_NOISE_8, FIR_NOISE_16, RGB_NOISE
 from page import OPENING, renewed
@@ -49,9 +51,13 @@ class Plan:
     calibration_rounds: int = 5
     warp_rounds: int = 9
     distinct: int = 12
+    recorded_s: float = 3.0
+    recording_rounds: int = 5
+    small_messages: int = 5000
+    campaign: preprocess.Amount = preprocess.Amount()
 
 
-QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 2, 4)
+QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 2, 4, 1.0, 1, 500, preprocess.QUICK)
 
 METHOD = """\
 Jobs that are compared run in turn (A B C A B C …) after a warm-up round; every figure is the median of its
@@ -132,6 +138,10 @@ SECTIONS: dict[str, Callable[[Plan, Workspace, Parts], None]] = {
     "lidar": _simple(lambda plan, _: lidar.measure(plan.lidar_rounds)),
     "warp": _simple(lambda plan, _: warp.measure(plan.warp_rounds)),
     "mine": _simple(lambda plan, space: mine.measure(space, plan.mine_rounds)),
+    "recordings": _simple(
+        lambda p, space: recordings.measure(space, p.recorded_s, p.small_messages, p.recording_rounds)
+    ),
+    "preprocess": _simple(lambda p, space: preprocess.measure(space, p.campaign)),
     "calibration": _simple(lambda plan, _: calibration.measure(plan.calibration_rounds)),
     "help": _simple(lambda plan, space: memory.measure_start(space, plan.help_rounds)),
 }
@@ -157,7 +167,8 @@ def method(plan: Plan) -> str:
         f" {plan.process_rounds} of whole processes, {plan.encode_rounds} of encoders,"
         f" {plan.memory_rounds} of memory, {plan.lidar_rounds} of LiDAR,"
         f" {plan.warp_rounds} of warps from a rig, {plan.mine_rounds} of the mine,"
-        f" {plan.calibration_rounds} of calibration,"
+        f" {plan.calibration_rounds} of calibration, {plan.recording_rounds} of recordings,"
+        f" {plan.campaign.rounds} of campaigns,"
         f" {plan.help_rounds} of start-up"
     )
     return METHOD.format(

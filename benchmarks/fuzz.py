@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -151,7 +152,9 @@ def main() -> int:
             return _again(options.case, seeds, options.seed, options.keep, scratch)
         began = time.monotonic()
         counts = shares(options.inputs, options.only)
-        outcomes = list(_told(runs.run(_task(options.seed, seeds), counts, scratch / "run"), sum(counts.values())))
+        (scratch / "seeds.pickle").write_bytes(pickle.dumps(seeds))
+        task = Task(options.seed, dict.fromkeys(READERS, ""), scratch / "seeds.pickle")
+        outcomes = list(_told(runs.run(task, counts, scratch / "run"), sum(counts.values())))
         for outcome in filter(_is_finding, outcomes):
             if options.keep:
                 _keep(outcome, seeds, options.seed, options.keep)
@@ -160,10 +163,6 @@ def main() -> int:
     if options.write:
         options.write.write_text(text, encoding="utf-8")
     return 1 if any(map(_is_finding, outcomes)) else 0
-
-
-def _task(number: int, seeds: Seeds, others: Mapping[str, str] | None = None) -> Task:
-    return Task(number, {**dict.fromkeys(READERS, ""), **(others or {})}, seeds)
 
 
 def _told(outcomes: Iterable[Outcome], total: int) -> Iterable[Outcome]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import functools
 import json
 import struct
@@ -130,8 +131,8 @@ def _shaped(value: Any, name: str, rng: Random) -> Any:
             "data": data,
         },
         "foxglove.CameraCalibration": {
-            **{**head, "width": 4, "height": 3, "distortion_model": "plumb_bob", "D": [0.0] * 5},
-            **{"K": [4, 0, 2, 0, 4, 1, 0, 0, 1], "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [0] * 12},
+            **head, "width": 4, "height": 3, "distortion_model": "plumb_bob", "D": [0.0] * 5,
+            "K": [4, 0, 2, 0, 4, 1, 0, 0, 1], "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [0] * 12,
         },
         "foxglove.FrameTransforms": {"transforms": [{"timestamp": stamp, "parent_frame_id": "a", "child_frame_id": "b",
                                                      "translation": zero, "rotation": {**zero, "w": 1}}]},
@@ -148,7 +149,7 @@ def _put(tree: Any, value: Any, rng: Random) -> None:
     while isinstance(tree, dict | list) and tree:
         key = rng.choice([*tree]) if isinstance(tree, dict) else rng.randrange(len(tree))
         if not isinstance(tree[key], dict | list) or not tree[key] or rng.random() < 0.2:
-            tree[key] = value
+            tree[key] = copy.deepcopy(value)  # never into itself
             return
         tree = tree[key]
 

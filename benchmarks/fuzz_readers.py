@@ -197,7 +197,7 @@ def settings(path: Path, seed: Seed) -> str:
 
 def record(path: Path, seed: Seed) -> str:
     del seed
-    from fusion.preprocess.chunks import Chunk
+    from fusion.chunks import Chunk
     from fusion.preprocess.records import read_record
 
     found = read_record(path.read_bytes(), "ab12", Chunk(3, 10, 20, 4))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import multiprocessing
 import os
+import pickle
 import pkgutil
 import resource
 import shutil
@@ -55,11 +56,14 @@ class TooLongError(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What every worker is told. `readers` are names of `READERS`, or "module:attribute" of others."""
+    """What every worker is told. `readers` are names of `READERS`, or "module:attribute" of others.
+
+    Seeds come in a file: `multiprocessing` waits for ever where a child dies before it has read what it is sent.
+    """
 
     number: int
     readers: Mapping[str, str]
-    seeds: Seeds
+    seeds_file: Path
     cpu_limit_s: float = CPU_LIMIT_S
     path: Sequence[str] = field(default_factory=lambda: tuple(sys.path))
 
@@ -99,6 +103,7 @@ def lay_out(seed: Seed, folder: Path) -> Path:
 class _Worker:
     def __init__(self, task: Task, root: Path) -> None:
         self._task, self._root = task, root
+        self._seeds: Seeds = pickle.loads(task.seeds_file.read_bytes())
         self._fired = False
         self._idle_mib = 0.0
         self._warm: set[str] = set()
@@ -115,7 +120,7 @@ class _Worker:
         if name in self._warm:
             return []
         self._warm.add(name)
-        count = len(self._task.seeds.get(reader.seeds, []))
+        count = len(self._seeds.get(reader.seeds, []))
         found = [self.run(reader, -1 - k, limited=False) for k in range(count)]
         _read_status()  # the first call must not count as growth
         self._idle_mib = _read_status()["VmRSS"]
@@ -125,7 +130,7 @@ class _Worker:
         folder = self._root / "case"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
-        seed = input_of(reader, self._task.seeds, self._task.number, case)
+        seed = input_of(reader, self._seeds, self._task.number, case)
         path = lay_out(seed, folder)
         began = time.process_time()
         with _bounded(reader.bound_mib + SPARE_MIB if limited else None):

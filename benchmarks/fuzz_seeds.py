@@ -152,8 +152,8 @@ def _images() -> list[Seed]:
     pictures = {"8": grey, "16": (grey.astype(np.uint16) * 250), "bgr": bgr, "bgra": np.dstack([bgr, grey])}
     seeds = []
     for suffix, kinds in {
-        **{".png": ("8", "16", "bgr", "bgra"), ".jpg": ("8", "bgr"), ".tiff": ("8", "16", "bgr", "bgra")},
-        **{".bmp": ("8", "bgr"), ".webp": ("bgr",), ".pgm": ("8", "16"), ".ppm": ("bgr",)},
+        ".png": ("8", "16", "bgr", "bgra"), ".jpg": ("8", "bgr"), ".tiff": ("8", "16", "bgr", "bgra"),
+        ".bmp": ("8", "bgr"), ".webp": ("bgr",), ".pgm": ("8", "16"), ".ppm": ("bgr",),
     }.items():
         for kind in kinds:
             data = cv2.imencode(suffix, pictures[kind])[1].tobytes()

@@ -27,7 +27,6 @@ from fusion.codecs import encode_png
 from fusion.preprocess.campaign import Route
 from fusion.preprocess.config import load_preprocess_config
 from fusion.preprocess.footage import Moment
-from fusion.preprocess.made import Made
 from fusion.preprocess.recorded import RecordedFootage
 from fusion.preprocess.run import preprocess
 from fusion.preprocess.streams import resolve_streams
@@ -35,27 +34,29 @@ from fusion.preprocess.work import PreprocessWork, make_plan
 from fusion.recordings import open_recording
 from fusion.rig import load_rig
 from fusion.simulate.containers import write_recording
+from fusion.sinks.base import Made
 from fusion.sinks.depth import quantised, sparse_npz
 
 LEAST_SHARE, FIRST_FRAME_S, START_S, DASK_GAIN = 0.9, 2.0, 1.0, 1.6
 POLL_S, WAIT_S = 0.005, 120.0
 
 TEXT = """\
-A simulated flight of {flight:g} s (RGB of 640x480 at 20 Hz as JPEG, thermal of 640x512 at 25 Hz, clouds at 10 Hz) as
-MCAP with ROS 2 messages, repeated end to end with stamps that go on; thermal is warped by each scan's depth, as a
-rig has it by default, and every output of the folder is written: fused, mask, thermal counts, depth, support,
-sparse depth.
+A simulated flight of {flight:g} s (RGB of 640x480 at 20 Hz as JPEG, thermal of 640x512 at 25 Hz, clouds
+at 10 Hz) as MCAP with ROS 2 messages, repeated end to end with stamps that go on; thermal is warped by
+each scan's depth, as a rig has it by default, and every output of the folder is written: fused, mask,
+thermal counts, depth, support, sparse depth.
 
-*Unavoidable* are these parts alone on the very same frames, in memory, on as many threads, one after the other:
-decoding (message and JPEG to RGB, message to thermal counts and to a cloud), densifying (`DepthLane.of_cloud`)
-and encoding what is written. Their sum is what no arrangement can avoid with these codecs and this method; not in it
-are reading, matching, windows, warping, blending, files and records, which the campaign does besides.
-{frames} frames in {chunks} chunks; *planned* adds opening the recording and the plan.
+*Unavoidable* are these parts alone on the very same frames, in memory, on as many threads, one after the
+other: decoding (message and JPEG to RGB, message to thermal counts and to a cloud), densifying
+(`DepthLane.of_cloud`) and encoding what is written. Their sum is what no arrangement can avoid with these
+codecs and this method; not in it are reading, matching, windows, warping, blending, files and records,
+which the campaign does besides. {frames} frames in {chunks} chunks; *planned* adds opening the recording
+and the plan.
 
-*Starting* is a whole process, `fusion preprocess` with the rig, from its start until it begins its first chunk
-(`run.toml` is there), or until the first file is in `fused/`; files are looked for every {poll:g} ms. The large
-recording has {gigabytes:.3g} GB. *Dask* is the same campaign with chunks of {dask_s:g} s on workers of a cluster that
-runs already and has done it once: one worker, or two."""
+*Starting* is a whole process, `fusion preprocess` with the rig, from its start until it begins its first
+chunk (`run.toml` is there), or until the first file is in `fused/`; files are looked for every {poll:g}
+ms. The large recording has {gigabytes:.3g} GB. *Dask* is the same campaign with chunks of {dask_s:g} s on
+workers of a cluster that runs already and has done it once: one worker, or two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,6 +311,6 @@ def repeat(
 
 
 def _later(data: bytes, seconds: int) -> bytes:
-    """A ROS 2 message that begins with a header, as CDR (4 bytes, then the stamp's seconds), moved in time."""
+    """A ROS 2 message with a header, as CDR (4 bytes, then the stamp's seconds), moved in time."""
     (own,) = struct.unpack_from("<i", data, 4)
     return b"".join((data[:4], struct.pack("<i", own + seconds), data[8:]))

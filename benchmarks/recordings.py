@@ -42,13 +42,14 @@ CONTAINERS = (
 )
 
 TEXT = """\
-A simulated flight of {seconds:g} s (RGB of 640x480 at 20 Hz, thermal of 640x512 as 16-bit counts at 25 Hz, clouds
-of 65,536 rays at 10 Hz), written in each container by `fusion simulate record`; and {small} images of
-{w}x{h} bytes, where a message costs more than its contents. Every message of the image and cloud topics is read
-and deserialised on one thread, ours to what `fusion.messages` reads, theirs to the library's own objects: rosbags'
-`AnyReader` for bags, `make_reader` with the decoders of mcap-ros1-support, mcap-ros2-support and
-mcap-protobuf-support for MCAP, `json` and `base64` for JSON. The recording is open on both sides before the clock
-starts. Ours checks the CRC of every chunk of an MCAP, the library's reader does not unless it is told to."""
+A simulated flight of {seconds:g} s (RGB of 640x480 at 20 Hz, thermal of 640x512 as 16-bit counts at 25
+Hz, clouds of 65,536 rays at 10 Hz), written in each container by `fusion simulate record`; and {small}
+images of {w}x{h} bytes, where a message costs more than its contents. Every message of the image and
+cloud topics is read and deserialised on one thread, ours to what `fusion.messages` reads, theirs to the
+library's own objects: rosbags' `AnyReader` for bags, `make_reader` with the decoders of
+mcap-ros1-support, mcap-ros2-support and mcap-protobuf-support for MCAP, `json` and `base64` for JSON. The
+recording is open on both sides before the clock starts. Ours checks the CRC of every chunk of an MCAP,
+the library's reader does not unless it is told to."""
 
 Read = Callable[[], int]  # reads all messages, and returns the bytes of their images and clouds
 

@@ -12,9 +12,24 @@ import fusion
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     {"errors", "frames"},
-    {"files", "tables", "settings", "open3d", "codecs", "png", "png16", "unfilter", "kernels", "geometry"},
-    {"rig"},
     {
+        "files",
+        "tables",
+        "settings",
+        "open3d",
+        "codecs",
+        "png",
+        "png16",
+        "unfilter",
+        "kernels",
+        "kernels16",
+        "geometry",
+        "recordings",
+        "timing",
+    },
+    {"rig", "radiometric", "storage"},
+    {
+        "chunks",
         "sources",
         "pairing",
         "homography",
@@ -28,12 +43,16 @@ FLOORS = [
         "manifest",
         "clouds",
     },
-    {"lidar"},
+    {"lidar", "messages"},
+    {"foxglove"},
     {"sync", "config", "simulate"},
+    {"fusing"},
     {"pipeline"},
     {"sinks", "provenance"},
     {"batch"},
+    {"preprocess"},
     {"report"},
+    {"inspect"},
     {"cli"},
 ]
 FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names}
@@ -51,6 +70,9 @@ SAME_FLOOR = {
     ("pairing", "sources"),
     ("clouds", "sources"),
     ("clouds", "pairing"),
+    ("kernels16", "kernels"),
+    ("manifest", "sources"),
+    ("manifest", "clouds"),
 }
 
 

@@ -34,6 +34,11 @@ SPOKEN_OF = {
     "depth.md": "fusion depth cloud.pcd",
     "mine.md": "fusion simulate mine mine/",
     "calibration.md": "fusion calibrate lidar rgb/ lidar/ --rig rig.toml -o out.toml",
+    "preprocess.md": "fusion preprocess flight.mcap -o out/",
+    "scale.md": "fusion preprocess flight.mcap -o out/",
+    "timing.md": "fusion preprocess flight.mcap -o out/",
+    "inspect.md": "fusion inspect flight.mcap",
+    "add-a-dataset.md": "fusion preprocess mine mine/ -o out/",
 }
 SHELLS = ("", "sh", "bash", "console")
 
@@ -159,6 +164,10 @@ ALL_OPTIONS = OPTIONS.union(
     options_of("calibrate", "stereo"),
     options_of("calibrate", "lidar"),
     options_of("calibrate", "convert"),
+    options_of("preprocess"),
+    options_of("inspect"),
+    options_of("datasets", "check"),
+    options_of("simulate", "record"),
 )
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 
+from fusion.chunks import Chunk, Work
 from fusion.errors import FusionError, InputError, OutputError, UsageError
-from fusion.preprocess.chunks import Chunk, Work
 from fusion.preprocess.local import Failed, Progress, no_progress, run_local
 from fusion.preprocess.records import Committed, claim, discard, finished
 from fusion.storage import RunStorage, open_storage

@@ -11,8 +11,8 @@ from pydantic import Field, ValidationError
 from fusion.config import BlendConfig
 from fusion.errors import UsageError
 from fusion.lidar.config import DepthConfig
-from fusion.preprocess.made import OUTPUTS
 from fusion.settings import Group, first_problem, merged, read_settings
+from fusion.sinks.base import OUTPUTS
 
 FORMAT = "fusion-preprocess/1"
 PATHS = (("fuse", "rig"),)
@@ -44,7 +44,7 @@ class StreamsConfig(Group):
 
 
 class OutputsConfig(Group):
-    """Where frames go (`fusion.preprocess.made.OUTPUTS`), and what of them is kept."""
+    """Where frames go (`fusion.sinks.base.OUTPUTS`), and what of them is kept."""
 
     kinds: tuple[str, ...] = Field(default=("folder",), min_length=1)
     counts: bool = True

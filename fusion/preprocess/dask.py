@@ -27,8 +27,8 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from fusion.batch import opencv_on_one_thread
+from fusion.chunks import Chunk, Work
 from fusion.errors import FusionError, InputError, UsageError
-from fusion.preprocess.chunks import Chunk, Work
 from fusion.preprocess.local import Failed, Progress, Tally, attempt, failed, no_progress
 from fusion.preprocess.records import Committed, owner_of
 from fusion.storage import RunStorage, Storage

@@ -12,12 +12,12 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from fusion.chunks import Chunk
 from fusion.clouds import read_cloud
 from fusion.errors import FrameError, InputError
 from fusion.frames import FrameSet, Image, PointCloud
 from fusion.manifest import Layout, Manifest
 from fusion.pairing import stamp_in_name, stamps_of
-from fusion.preprocess.chunks import Chunk
 from fusion.provenance import digest
 from fusion.sync import PairedSources, Pairs, open_pairs
 

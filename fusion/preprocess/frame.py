@@ -16,7 +16,7 @@ from fusion.fusing import FrameFuser, Stages
 from fusion.lidar.lane import DepthFrame, DepthLane
 from fusion.preprocess.config import PreprocessConfig
 from fusion.preprocess.footage import Moment
-from fusion.preprocess.made import Made
+from fusion.sinks.base import Made
 from fusion.sinks.depth import quantised
 from fusion.thermal import WindowPlan
 

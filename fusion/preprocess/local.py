@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from itertools import islice
 
 from fusion.batch import opencv_on_one_thread
+from fusion.chunks import Chunk, Work
 from fusion.errors import FusionError, OutputError
-from fusion.preprocess.chunks import Chunk, Work
 from fusion.preprocess.records import Committed, do_chunk
 from fusion.storage import Storage
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.chunks import Chunk
 from fusion.errors import FrameError, InputError
 from fusion.frames import FrameSet, Image, PointCloud
 from fusion.messages import reader_of
 from fusion.messages.base import CompressedImage, MessageReader, Points, RawImage
 from fusion.messages.clouds import cloud_of_points
 from fusion.messages.images import image_of
-from fusion.preprocess.chunks import Chunk
 from fusion.preprocess.footage import Dropped, Moment
 from fusion.recordings import open_recording
 from fusion.recordings.base import Packet, Recording, Topic

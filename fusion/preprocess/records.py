@@ -17,13 +17,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
+from fusion.chunks import FOLDER, Chunk, Done, Work, record_name
 from fusion.errors import InputError, OutputError
-from fusion.preprocess.chunks import Chunk, Done, Work
 from fusion.storage import RunStorage, Storage, checked_name
 
 RECORD_FORMAT = "fusion-chunk/1"
 CAMPAIGN_FORMAT = "fusion-campaign/1"
-FOLDER = "chunks"
 CAMPAIGN = f"{FOLDER}/campaign.json"
 MAX_RECORD_BYTES = 1 << 28
 READERS = 16  # records read at once: an object store answers each only after some time
@@ -50,10 +49,6 @@ class Finished:
 
     done: dict[int, Committed]
     again: Mapping[str, int] = field(default_factory=dict)
-
-
-def record_name(chunk: Chunk) -> str:
-    return f"{FOLDER}/{chunk.name}.json"
 
 
 def do_chunk(work: Work, chunk: Chunk, out: Storage, tick: Callable[[], None]) -> Committed:

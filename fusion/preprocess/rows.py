@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fusion.errors import FrameError
-from fusion.preprocess.made import Made
+from fusion.sinks.base import Made
 
 
 @dataclass(frozen=True, slots=True)

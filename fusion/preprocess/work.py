@@ -13,19 +13,19 @@ from typing import Any
 
 import tomlkit
 
+from fusion.chunks import Chunk, Done
 from fusion.errors import FrameError, InputError
 from fusion.fusing import FrameFuser, Sizes
 from fusion.lidar.lane import DepthLane
 from fusion.lidar.sparse import Value
-from fusion.preprocess.chunks import Chunk, Done
 from fusion.preprocess.config import PreprocessConfig
 from fusion.preprocess.footage import Dropped, Footage, Moment
 from fusion.preprocess.frame import FrameMaker
-from fusion.preprocess.made import OUTPUTS, ChunkOutput, Output, Setup
 from fusion.preprocess.rows import FrameRow
 from fusion.provenance import describe_registration, plain, versions
 from fusion.registration import Registration
 from fusion.rig import Rig
+from fusion.sinks.base import OUTPUTS, ChunkOutput, Output, Setup
 from fusion.sinks.run_folder import RUN_FORMAT
 from fusion.storage import Storage
 from fusion.thermal import WindowPlan, plan_windows
@@ -72,7 +72,7 @@ def _first_sizes(footage: Footage, config: PreprocessConfig) -> Sizes:
 
 
 class PreprocessWork:
-    """A campaign over one footage: `fusion.preprocess.chunks.Work`."""
+    """A campaign over one footage: `fusion.chunks.Work`."""
 
     def __init__(self, footage: Footage, config: PreprocessConfig, plan: Plan, rig: Rig | None) -> None:
         self.footage, self.config, self.plan, self.rig = footage, config, plan, rig
@@ -140,7 +140,7 @@ class PreprocessWork:
             return self._ready
 
     def do(self, chunk: Chunk, out: Storage, tick: Callable[[], None]) -> Done:
-        """Make all frames of a chunk; see `fusion.preprocess.chunks.Work`."""
+        """Make all frames of a chunk; see `fusion.chunks.Work`."""
         began = time.monotonic()
         maker, outputs = self.parts()
         writing = [output.open(chunk, out) for output in outputs]

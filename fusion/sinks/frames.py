@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made, Setup
+from fusion.chunks import Chunk
+from fusion.sinks.base import Made, Setup
 from fusion.sinks.depth import sparse_npz
 from fusion.storage import Storage
 

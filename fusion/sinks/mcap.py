@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.chunks import Chunk
 from fusion.codecs import encode_jpeg, encode_png
 from fusion.errors import FrameError
 from fusion.foxglove import calibration_of, protobuf_bytes, raw_image, schema_name, transforms_of
@@ -28,8 +29,7 @@ from fusion.messages.base import (
     RawImage,
     Transforms,
 )
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made, Setup
+from fusion.sinks.base import Made, Setup
 from fusion.sinks.mcap_file import McapFile, Piece, join, joined_pieces
 from fusion.sinks.parts import JoinedParts, replace_by, stamp_of
 from fusion.storage import Storage

@@ -9,11 +9,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from fusion.chunks import Chunk, record_name
 from fusion.errors import OutputError
 from fusion.files import output_error
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made
-from fusion.preprocess.records import record_name
+from fusion.sinks.base import Made
 from fusion.storage import Storage
 
 NO_RATE_HZ = 10.0  # of frames without clock, where nobody knows their rate

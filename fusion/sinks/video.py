@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.chunks import Chunk
 from fusion.errors import FrameError, OutputError, UsageError
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made, Setup
+from fusion.sinks.base import Made, Setup
 from fusion.sinks.parts import NO_RATE_HZ, JoinedParts, replace_by, stamp_of
 from fusion.storage import Storage
 

@@ -15,9 +15,9 @@ import pytest
 from machines import until
 from toy_work import ToyWork, chunks_of, content, run_toy, tree
 
+from fusion.chunks import Chunk, Done
 from fusion.errors import FusionError, InputError, OutputError, UsageError
 from fusion.preprocess.campaign import UNSTORED_IN_A_ROW, Pace, Report, Route, run_campaign
-from fusion.preprocess.chunks import Chunk, Done
 from fusion.preprocess.local import Failed, Stopped, Tally, run_local
 from fusion.preprocess.records import Committed, claim, finished
 from fusion.storage import RunStorage, Storage, open_storage

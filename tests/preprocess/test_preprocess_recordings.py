@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
+from fusion.chunks import Chunk
 from fusion.cli.preprocessing import run_preprocess
 from fusion.errors import InputError, UsageError
 from fusion.preprocess.campaign import Route
-from fusion.preprocess.chunks import Chunk
 from fusion.preprocess.config import PreprocessConfig, StreamsConfig
 from fusion.preprocess.footage import Dropped, Moment
 from fusion.preprocess.recorded import RecordedFootage

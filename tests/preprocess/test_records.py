@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from toy_work import ToyWork, chunks_of
 
+from fusion.chunks import Chunk, Done
 from fusion.errors import InputError, OutputError
-from fusion.preprocess.chunks import Chunk, Done
 from fusion.preprocess.records import (
     CAMPAIGN,
     claim,

@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from fusion.chunks import Chunk, Done
 from fusion.errors import FusionError, InputError
 from fusion.preprocess.campaign import Report, Route, run_campaign
-from fusion.preprocess.chunks import Chunk, Done
 from fusion.preprocess.records import rows_of
 from fusion.storage import RunStorage, Storage, open_storage
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.chunks import Chunk
 from fusion.codecs import encode_jpeg, encode_png
 from fusion.frames import FrameSet, FusedFrame, Image, PointCloud, Window
 from fusion.geometry import FisheyeCamera, PinholeCamera, invert
 from fusion.lidar.lane import DepthFrame
 from fusion.lidar.sparse import DenseDepth, SparseDepth, Value
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made, Output, Setup
 from fusion.rig import Rig
+from fusion.sinks.base import Made, Output, Setup
 from fusion.storage import Storage
 
 SIZE_WH = (48, 32)

@@ -40,14 +40,14 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from fusion.chunks import Chunk
 from fusion.codecs import decode_image, encode_png
 from fusion.errors import FrameError, OutputError
 from fusion.frames import FrameSet, Image
 from fusion.geometry import FisheyeCamera, PinholeCamera
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Made, Setup
 from fusion.preprocess.records import record_name
 from fusion.sinks import mcap_file
+from fusion.sinks.base import Made, Setup
 from fusion.sinks.mcap import PARTS, McapOutput, depth_mm
 from fusion.storage import LocalFolder, Storage, open_storage
 

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from made_frames import CHUNKS, SETUP, SIZE_WH, do, file_bytes, frames_of, made, picture, stamp
 
+from fusion.chunks import Chunk
 from fusion.errors import FrameError, OutputError, UsageError
-from fusion.preprocess.chunks import Chunk
-from fusion.preprocess.made import Setup
 from fusion.preprocess.records import record_name
+from fusion.sinks.base import Setup
 from fusion.sinks.video import PARTS, VideoOutput
 from fusion.storage import LocalFolder, open_storage
 

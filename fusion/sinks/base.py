@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.chunks import Chunk
 from fusion.frames import FrameSet, FusedFrame
 from fusion.geometry import Camera
 from fusion.lidar.lane import DepthFrame
-from fusion.preprocess.chunks import Chunk
 from fusion.rig import Rig
 from fusion.storage import Storage
 

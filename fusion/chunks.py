@@ -8,6 +8,8 @@ from typing import Protocol
 
 from fusion.storage import Storage
 
+FOLDER = "chunks"  # of the records, in the output
+
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
@@ -30,8 +32,8 @@ class Chunk:
 class Done:
     """What became of a chunk, as its record in the output says it: committed after everything it names.
 
-    `rows` are the rows of the index; `files` the names and sizes of all files that the chunk wrote; `lost` counts by
-    role and reason what belongs to no frame; `seconds` the time it took.
+    `rows` are the rows of the index; `files` the names and sizes of all files that the chunk wrote; `lost`
+    counts by role and reason what belongs to no frame; `seconds` the time it took.
     """
 
     chunk: Chunk
@@ -41,18 +43,24 @@ class Done:
     seconds: float
 
 
+def record_name(chunk: Chunk) -> str:
+    """What a chunk's record is called: written after everything that it names."""
+    return f"{FOLDER}/{chunk.name}.json"
+
+
 class Work(Protocol):
     """A campaign: its chunks, and how to do one. Picklable, so that another machine may do it.
 
-    `run_id` is what makes the run what it is (a hash of configuration, plan and inputs): records of another run do
-    not count as done.
+    `run_id` is what makes the run what it is (a hash of configuration, plan and inputs): records of another
+    run do not count as done.
     """
 
     run_id: str
     chunks: Sequence[Chunk]
 
     def do(self, chunk: Chunk, out: Storage, tick: Callable[[], None]) -> Done:
-        """Make the chunk's files in `out`; idempotent: the same bytes under the same names. `tick` is called once a
-        frame. Raises `FusionError`. Does not commit: the executor writes the record when this has returned.
+        """Make the chunk's files in `out`; idempotent: the same bytes under the same names. `tick` is
+        called once a frame. Raises `FusionError`. Does not commit: the executor writes the record when this
+        has returned.
         """
         ...
