@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test check lint types wheel notebooks bench accuracy clean
+.PHONY: help demo test check lint types wheel notebooks bench accuracy fuzz clean
 
 help:
 	@echo "make demo       sample data, the main job on it, where to look"
@@ -11,6 +11,7 @@ help:
 	@echo "make check      all that CI runs: lint, types, tests, notebooks, wheel"
 	@echo "make bench      the benchmarks; writes docs/benchmarks.md"
 	@echo "make accuracy   errors of depth, calibration and timing; writes its tables into docs/"
+	@echo "make fuzz       hostile inputs for every reader; writes docs/fuzz.md"
 	@echo "make notebooks  run the notebooks"
 	@echo "make clean      remove environments and products"
 
@@ -58,6 +59,9 @@ bench: $(VENV)/ready
 
 accuracy: $(VENV)/ready
 	$(BIN)/python benchmarks/accuracy.py --write docs
+
+fuzz: $(VENV)/ready
+	$(BIN)/python benchmarks/fuzz.py --write docs/fuzz.md
 
 clean:
 	rm -rf $(VENV) demo dist .pytest_cache .ruff_cache .hypothesis

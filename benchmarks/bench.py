@@ -54,7 +54,7 @@ class Plan:
     recorded_s: float = 3.0
     recording_rounds: int = 5
     small_messages: int = 5000
-    campaign: preprocess.Amount = preprocess.Amount()
+    campaign: preprocess.Amount = preprocess.FULL
 
 
 QUICK = Plan(3, 2, 12, 1, 24, 2, 1, 40, 400, 3, 2, 1, 2, 2, 4, 1.0, 1, 500, preprocess.QUICK)

@@ -32,7 +32,7 @@ from fusion.errors import FusionError
 CPU_LIMIT_S = 5.0  # of an input
 WALL_LIMIT_S = 90.0  # of an input that sleeps instead; the machine may be busy
 SPARE_MIB = 1024  # of addresses above a reader's bound: a larger request fails, and is found
-MOST_WORDS = 3000  # letters of a refusal: more is no clear line
+MOST_WORDS = 2000  # letters of a refusal: more is no clear line
 FRESH_AFTER = 1500  # inputs of one process
 _BATCH = 50
 _MIB = 1 << 20

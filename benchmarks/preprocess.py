@@ -69,9 +69,10 @@ class Amount:
     starts: int = 5
     large_bytes: float = 10e9
     chunk_s: float = 4.5
-    dask_chunk_s: float = 1.0
+    dask_chunk_s: float = 0.9
 
 
+FULL = Amount()
 QUICK = Amount(1.0, 2, 1, 1, 0.5e9, 1.0, 0.5)
 
 
@@ -274,7 +275,7 @@ def _cluster(workers: int) -> Iterator[Route]:
     from distributed import LocalCluster
 
     with LocalCluster(
-        n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0"
     ) as cluster:
         yield Route(scheduler=cluster.scheduler_address)
 

@@ -6,6 +6,8 @@ line prints and exits; library callers catch `FusionError` or one of its kinds.
 
 from __future__ import annotations
 
+MOST_LETTERS = 2000  # of an error's line
+
 
 class FusionError(Exception):
     """What went wrong, where, and what to do next, in one line.
@@ -25,7 +27,10 @@ class FusionError(Exception):
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
         text = f"{text} ({self.hint})" if self.hint else text
-        return " ".join(text.split())
+        line = " ".join(text.split())
+        if len(line) > MOST_LETTERS:  # it quotes a file that holds a long word
+            line = f"{line[: MOST_LETTERS - 300]} … {line[-290:]}"
+        return line
 
 
 class UsageError(FusionError):

@@ -40,6 +40,21 @@ SPOKEN_OF = {
     "inspect.md": "fusion inspect flight.mcap",
     "add-a-dataset.md": "fusion preprocess mine mine/ -o out/",
 }
+OTHERS = (
+    "fusion preprocess flight.mcap -o out/",
+    "fusion inspect flight.mcap",
+    "fusion datasets check mine mine/",
+    "fusion simulate record mine/ mine.bag --form rosbag1",
+)
+DASKS = {
+    "--tls-ca-file",
+    "--nworkers",
+    "--no-dashboard",
+    "--death-timeout",
+    "--lifetime",
+    "--tls-cert",
+    "--tls-key",
+}
 SHELLS = ("", "sh", "bash", "console")
 
 
@@ -137,8 +152,19 @@ def spoken(document: Path) -> Iterator[str]:
     for span in re.findall(r"`([^`\n]+)`", prose(document)):
         if span.startswith("fusion "):
             yield span
-        elif span.startswith("--"):
-            yield f"{SPOKEN_OF.get(document.name, 'fusion blend rgb/ fir/')} {span}"
+        elif span.startswith("--") and span.split()[0] not in DASKS:
+            yield f"{_command_with(span.split()[0], document.name)} {span}"
+
+
+def _command_with(option: str, document: str) -> str:
+    """The document's own command, or another one that has the option."""
+    own = SPOKEN_OF.get(document, "fusion blend rgb/ fir/")
+    for command in (own, *OTHERS):
+        words = command.split()[1:]
+        path = words[:2] if words[0] in ("simulate", "calibrate", "datasets") else words[:1]
+        if option in options_of(*path):
+            return command
+    return own
 
 
 def parse(line: str) -> None:

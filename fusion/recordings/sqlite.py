@@ -163,6 +163,8 @@ class Sqlite3Recording:
             odd = "timestamp IS NULL OR timestamp < 0 OR timestamp >= ?"
             query = f"SELECT count(*) FROM messages WHERE {odd}"  # noqa: S608
             count = db.execute(query, (MAX_TIME_NS,)).fetchone()[0]
+            if (ends[0] is None) != (ends[1] is None):
+                raise sqlite3.DatabaseError("its index by time contradicts itself")
         except _DAMAGES as error:
             self._damaged(error)
             span = None
@@ -171,7 +173,7 @@ class Sqlite3Recording:
             return span
         if count:
             self.noted.add(f"{self.shown}: {count} messages without a possible time are left out")
-        return None if ends[0] is None else (int(ends[0]), int(ends[1]) + 1)
+        return None if None in ends else (int(ends[0]), int(ends[1]) + 1)
 
     def _damaged(self, error: Exception) -> None:
         self._ordered = False

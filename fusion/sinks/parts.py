@@ -65,6 +65,9 @@ class JoinedParts:
             names = join(folder, keys)
         for part in parts if names else ():
             out.remove(part)
+        with suppress(OSError):  # another output's parts may still be there
+            for empty in (folder / self.folder, (folder / self.folder).parent):
+                empty.rmdir()
         return names
 
     def _check(self, missing: Sequence[Chunk], out: Storage) -> None:
