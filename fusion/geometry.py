@@ -286,7 +286,7 @@ class PinholeCamera(_Lens):
         return _inverse(lambda at: at * self._radial(at * at)[0], r0, limit, 30)
 
     def _newton(self, a0: Floats, b0: Floats, r0: Floats, start: Floats) -> tuple[Floats, Floats]:
-        """Which (a, b) are distorted to (a0, b0), from the radii `start` on; NaN where none was arrived at."""
+        """Which (a, b) are distorted to (a0, b0), from the radii `start` on; NaN where none is found."""
         limit = min(self.valid_radius(), 1e3)
         scale = np.divide(start, r0, out=np.ones_like(start), where=r0 > 0)
         a, b = scale * a0, scale * b0

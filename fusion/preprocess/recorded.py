@@ -25,10 +25,7 @@ from fusion.recordings import open_recording
 from fusion.recordings.base import Packet, Recording, Topic
 from fusion.timing.match import margin_ns, match_streams
 
-PLACES, LOOKED_AT = (
-    5,
-    40,
-)  # where a stream is looked at to know its rate and delay, and how many messages there
+PLACES, LOOKED_AT = 5, 12  # where streams are looked at for their rates and delays; messages there
 SLACK_NS = 300_000_000  # how much beyond the delays seen a message may be late
 LONGEST_LOOK_NS = 3_000_000_000
 MOST_APART_NS = 30_000_000_000

@@ -6,7 +6,6 @@ are unpacked. Messages in no chunk are gathered to runs of about a mebibyte, whi
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import BinaryIO
@@ -14,7 +13,7 @@ from typing import BinaryIO
 from fusion.recordings import mcap_records as r
 from fusion.recordings.chunks import LAST_NS, MAX_OTHERS, Chunk, Contents
 from fusion.recordings.files import DamagedError, Faults, read_at
-from fusion.recordings.unpack import MAX_CHUNK_BYTES, check_size, unpack, unpack_beginning
+from fusion.recordings.unpack import MAX_CHUNK_BYTES, check_size, crc32, unpack, unpack_beginning
 
 RUN_BYTES = 1 << 20
 _MIN_MESSAGE = 22
@@ -182,7 +181,7 @@ def chunk_data(file: BinaryIO, chunk: Chunk) -> r.Bytes:
     if chunk.cut:
         return unpack_beginning(form, data, min(size, MAX_CHUNK_BYTES))
     found = unpack(form, data, size)
-    if crc and zlib.crc32(found) != crc:
+    if crc and crc32(found) != crc:
         raise DamagedError("its CRC does not fit its contents")
     return found
 
