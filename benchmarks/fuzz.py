@@ -1,4 +1,4 @@
-"""`python benchmarks/fuzz.py [--write docs/fuzz.md] [--inputs N] [--seed N] [--case READER:K]`: hostile inputs.
+"""`python benchmarks/fuzz.py [--write docs/fuzz.md] [--inputs N] [--seed N] [--case READER:K]`: bad inputs.
 
 Every reader is given damaged and drawn inputs, each in a process that is watched. An input may be read, or
 refused with a line of ours; all else is a finding. `--case` makes one input again, reads it in this process
@@ -26,7 +26,7 @@ from fuzz_seeds import Seeds, all_seeds
 from workspace import MEMORY_BACKED, version_lines
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"
-INPUTS = 24_000
+INPUTS = 40_000
 FINE = ("read", "refused")
 
 
@@ -48,7 +48,9 @@ def page(outcomes: list[Outcome], seeds: Seeds, number: int, seconds: float, rea
     findings = [_finding(outcome) for outcome in bad[:100]] or ["None."]
     return "\n".join(
         [
-            _HEAD.format(cpu=runs.CPU_LIMIT_S, wall=runs.WALL_LIMIT_S, spare=runs.SPARE_MIB, words=runs.MOST_WORDS),
+            _HEAD.format(
+                cpu=runs.CPU_LIMIT_S, wall=runs.WALL_LIMIT_S, spare=runs.SPARE_MIB, words=runs.MOST_WORDS
+            ),
             "## Result\n",
             f"{len(inputs):,} inputs, {len(bad)} findings, in {seconds / 60:.1f} minutes with two processes;"
             f" {datetime.now(UTC):%Y-%m-%d}, seed {number}, {real}.\n",
@@ -68,22 +70,25 @@ _HEAD = """# Fuzzing
 
 Written by `make fuzz`; every figure is of the run named below.
 
-Every reader gets inputs that nobody meant to be read: sound files damaged at random (bits, runs of bytes, cuts,
-blocks doubled, left out or swapped, pieces of other files, lengths and counts of 1 to 8 bytes made extreme; texts
-word by word, and brackets and YAML references nested until a careless reader has no stack or memory left), and
-inputs drawn by hypothesis and by hand where damage would not reach. Half of the damaged PNGs get right checksums
-again, and every second MCAP has none. Seeds are recordings of a tiny simulated mine in every container and
-compression, drawn images and clouds, and the real files of the shared data where they are there.
+Every reader gets inputs that nobody meant to be read: sound files damaged at random (bits, runs of bytes,
+cuts, blocks doubled, left out or swapped, pieces of other files, lengths and counts of 1 to 8 bytes made
+extreme; texts word by word, and brackets and YAML references nested until a careless reader has no stack or
+memory left), and inputs drawn by hypothesis and by hand where damage would not reach. Half of the damaged
+PNGs get right checksums again, and every second MCAP has none. Seeds are recordings of a tiny simulated mine
+in every container and compression, drawn images and clouds, and the real files of the shared data where they
+are there.
 
-An input may be **read**, or **refused** with a `FusionError`, a line of at most {words:,} letters. All else is a
-finding: another exception, a crash, a file left behind or outside its folder, more than {cpu:g} s of CPU
-(a process that sleeps {wall:g} s is killed as well), or memory above the bound. Memory is the highest resident size while
-the input is read, less that of the idle process that has read every sound seed; the bound is 512 MiB, and 1.5 GiB where
-a format's own stated limit lets a chunk or a packed message unpack to 1 GiB. A request for more than {spare:,} MiB of
-addresses above the bound fails, and is a finding even if a reader makes a refusal of it.
+An input may be **read**, or **refused** with a `FusionError`, a line of at most {words:,} letters (damaged
+records of chunks are refused by a word). All else is a finding: another exception, a crash, a file left
+behind or beside its folder, a path or name that leads out of its root, more than {cpu:g} s of CPU (a process
+that sleeps {wall:g} s is killed as well), or memory above the bound. Memory is the highest resident size
+while the input is read, less that of the idle process that has read every sound seed; the bound is 512 MiB,
+and 1.5 GiB where a format's own stated limit lets a chunk or a packed message unpack to 1 GiB. Addresses are
+limited to {spare:,} MiB above the bound: a request for more fails, and is a finding even if a reader makes a
+refusal of it.
 
-One case again, with its traceback: `python benchmarks/fuzz.py --seed N --case READER:K` (with the same libraries and the
-same shared data; `--keep FOLDER` saves its files).
+One case again, with its traceback: `python benchmarks/fuzz.py --seed N --case READER:K` (with the same
+libraries and the same shared data; `--keep FOLDER` saves its files).
 """
 
 
@@ -133,7 +138,9 @@ def _again(case: str, seeds: Seeds, number: int, keep: Path | None, scratch: Pat
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--write", type=Path, help="the page to write")
     parser.add_argument("--inputs", type=int, default=INPUTS)
     parser.add_argument("--seed", type=int, default=1)

@@ -50,44 +50,82 @@ def _one_input(strategy: st.SearchStrategy[Any]) -> Callable[[bytes, list[Any]],
 
 # -- definitions and JSON messages
 
-_NAMES = st.sampled_from(["header", "stamp", "data", "width", "height", "a", "encoding", "points", "frame_id"])
-_TYPES = st.sampled_from(
-    [*("bool", "byte", "int8", "uint8", "int64", "float32", "float64", "string", "wstring", "time", "duration")]
-    + [*("Header", "std_msgs/Header", "a/B", "a/msg/C", "B", "builtin_interfaces/Time", "sensor_msgs/PointField")]
-    + [*("string<=8", "uint8<=3", "unknown/Type", "boolean", "sequence<octet>", "octet", "Image")]
+_NAMES = st.sampled_from(
+    ["header", "stamp", "data", "width", "height", "a", "encoding", "points", "frame_id"]
 )
-_ARRAYS = st.sampled_from(["", "", "", "[]", "[3]", "[0]", "[<=4]", "[1048576]", "[4294967295]", "[9999999999]", "[-1]"])
-_RESTS = st.sampled_from(["", "", " # x", "=3", " 'x'", " [1, 2]", "=", ' "a#b"'])
-_FIELDS = st.lists(st.builds("{0}{1} {2}{3}".format, _TYPES, _ARRAYS, _NAMES, _RESTS), max_size=12).map("\n".join)
+_TYPE_WORDS = """
+bool byte int8 uint8 int64 float32 float64 string wstring time duration Header std_msgs/Header a/B a/msg/C B Image
+builtin_interfaces/Time sensor_msgs/PointField string<=8 uint8<=3 unknown/Type boolean sequence<octet> octet
+"""
+_ARRAY_WORDS = "[] [3] [0] [<=4] [1048576] [4294967295] [9999999999] [-1]"
+_TYPES = st.sampled_from(_TYPE_WORDS.split())
+_ARRAYS = st.sampled_from(("", "", "", *_ARRAY_WORDS.split()))
+_RESTS = st.sampled_from(("", "", " # x", "=3", " 'x'", " [1, 2]", "=", ' "a#b"'))
+_FIELDS = st.lists(st.builds("{0}{1} {2}{3}".format, _TYPES, _ARRAYS, _NAMES, _RESTS), max_size=12).map(
+    "\n".join
+)
 _PARTS = st.lists(
     st.builds(
         "{0}\n{1}: {2}\n{3}".format,
         st.sampled_from(["=" * 80, "=", "==="]),
         st.sampled_from(["MSG", "IDL"]),
-        st.sampled_from(["std_msgs/Header", "a/B", "a/msg/C", "sensor_msgs/Image", "sensor_msgs/msg/PointField"]),
+        st.sampled_from(
+            ["std_msgs/Header", "a/B", "a/msg/C", "sensor_msgs/Image", "sensor_msgs/msg/PointField"]
+        ),
         _FIELDS,
     ),
     max_size=6,
 )
 _MSG = st.builds(lambda first, parts: "\n".join([first, *parts]), _FIELDS, _PARTS)
-_IDL_WORDS = st.sampled_from(
-    [*("module", "struct", "enum", "union", "typedef", "const", "sequence", "string", "octet", "boolean", "x", "a")]
-    + [*("{", "}", "};", "<", ">", "[", "]", ";", ";", "::", ",", "=", "3", "4294967296", "long", "unsigned long")]
-    + [*("sensor_msgs", "msg", "Image", "@key", "@default (value=0)", "//", "/*", "*/", '"t"', "#include", "double")]
-)
-_IDL = st.lists(_IDL_WORDS, max_size=80).map(" ".join)
+_IDL_WORDS = """
+module struct enum union typedef const sequence string octet boolean x a { } }; < > [ ] ; ; :: , = 3
+4294967296 long unsigned sensor_msgs msg Image @key @default (value=0) // /* */ #include double
+"""
+_IDL = st.lists(st.sampled_from(_IDL_WORDS.split()), max_size=80).map(" ".join)
 _NUMBER = st.one_of(st.integers(), st.floats(), st.sampled_from([*EXTREMES]))
-_LEAF = st.one_of(st.none(), st.booleans(), _NUMBER, st.text(max_size=8), st.binary(max_size=40).map(base64.b64encode))
-_JSON_NAMES = ["timestamp", "sec", "nsec", "frame_id", "width", "height", "step", "encoding", "data", "format"]
-_JSON_NAMES += ["point_stride", "fields", "name", "offset", "type", "pose", "position", "orientation", "x", "y", "z"]
+_LEAF = st.one_of(
+    st.none(), st.booleans(), _NUMBER, st.text(max_size=8), st.binary(max_size=40).map(base64.b64encode)
+)
+_JSON_NAMES = [
+    "timestamp",
+    "sec",
+    "nsec",
+    "frame_id",
+    "width",
+    "height",
+    "step",
+    "encoding",
+    "data",
+    "format",
+]
+_JSON_NAMES += [
+    "point_stride",
+    "fields",
+    "name",
+    "offset",
+    "type",
+    "pose",
+    "position",
+    "orientation",
+    "x",
+    "y",
+    "z",
+]
 _JSON_NAMES += ["w", "D", "K", "R", "P", "distortion_model", "transforms", "translation", "rotation"]
 _JSON = st.recursive(
     _LEAF,
-    lambda inner: st.lists(inner, max_size=12) | st.dictionaries(st.sampled_from(_JSON_NAMES), inner, max_size=10),
+    lambda inner: (
+        st.lists(inner, max_size=12) | st.dictionaries(st.sampled_from(_JSON_NAMES), inner, max_size=10)
+    ),
     max_leaves=40,
 )
 _ROS_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage", "a/msg/B")
-_JSON_TYPES = ("foxglove.RawImage", "foxglove.PointCloud", "foxglove.CameraCalibration", "foxglove.FrameTransforms")
+_JSON_TYPES = (
+    "foxglove.RawImage",
+    "foxglove.PointCloud",
+    "foxglove.CameraCalibration",
+    "foxglove.FrameTransforms",
+)
 
 
 def definition(rng: Random, seed: Seed) -> Seed:
@@ -97,7 +135,9 @@ def definition(rng: Random, seed: Seed) -> Seed:
     kind = rng.choice(("msg", "msg", "idl", "json"))
     if kind == "json":
         topic = Topic("/t", Schema(rng.choice(_JSON_TYPES), "jsonschema", b"{}"), "json")
-        data = json.dumps(_shaped(drawn(_JSON, rng), topic.schema.name, rng), default=lambda b: b.decode()).encode()
+        data = json.dumps(
+            _shaped(drawn(_JSON, rng), topic.schema.name, rng), default=lambda b: b.decode()
+        ).encode()
         return Seed(kind, {"message": data, "definition.msg": b"{}"}, about=topic)
     text = drawn(_MSG if kind == "msg" else _IDL, rng) or ""
     name = rng.choice(_ROS_TYPES)
@@ -112,7 +152,10 @@ def definition(rng: Random, seed: Seed) -> Seed:
 
 def _counts(rng: Random) -> bytes:
     """Bytes in which lengths are often small, sometimes extreme."""
-    words = (rng.choice((0, 1, 2, 3, 8, 1 << 16, (1 << 32) - 1, rng.getrandbits(32))) for _ in range(rng.randrange(80)))
+    words = (
+        rng.choice((0, 1, 2, 3, 8, 1 << 16, (1 << 32) - 1, rng.getrandbits(32)))
+        for _ in range(rng.randrange(80))
+    )
     return struct.pack("<" + "I" * len(found := list(words)), *found)
 
 
@@ -134,8 +177,14 @@ def _shaped(value: Any, name: str, rng: Random) -> Any:
             **head, "width": 4, "height": 3, "distortion_model": "plumb_bob", "D": [0.0] * 5,
             "K": [4, 0, 2, 0, 4, 1, 0, 0, 1], "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [0] * 12,
         },
-        "foxglove.FrameTransforms": {"transforms": [{"timestamp": stamp, "parent_frame_id": "a", "child_frame_id": "b",
-                                                     "translation": zero, "rotation": {**zero, "w": 1}}]},
+        "foxglove.FrameTransforms": {
+            "transforms": [
+                {
+                    **{"timestamp": stamp, "parent_frame_id": "a", "child_frame_id": "b"},
+                    **{"translation": zero, "rotation": {**zero, "w": 1}},
+                }
+            ]
+        },
     }[name]  # fmt: skip
     if rng.random() < 0.2:
         return value
@@ -181,7 +230,24 @@ def toml(rng: Random, seed: Seed) -> Seed:
 # -- names
 
 
-_PIECES = ("..", ".", "", "a", "b.png", "/", "\\", "C:", "~", "\x00", "é", "\udcff", "\ud800", " ", "...", "a" * 300)
+_PIECES = (
+    "..",
+    ".",
+    "",
+    "a",
+    "b.png",
+    "/",
+    "\\",
+    "C:",
+    "~",
+    "\x00",
+    "é",
+    "\udcff",
+    "\ud800",
+    " ",
+    "...",
+    "a" * 300,
+)
 _PIECES += (f".{'0' * 32}.tmp", "%2e%2e", "con", "\n", "\u2215", "\uff0e\uff0e", "-", "*")
 
 
@@ -211,7 +277,9 @@ def picture(rng: Random, seed: Seed) -> Seed:
     from fusion.messages.pixels import ENCODINGS, YUV
 
     if rng.random() < 0.25:
-        word = rng.choice(("16UC1; compressedDepth png", "32FC1; compressedDepth rvl", "16UC1; compressedDepth", "jpeg"))
+        word = rng.choice(
+            ("16UC1; compressedDepth png", "32FC1; compressedDepth rvl", "16UC1; compressedDepth", "jpeg")
+        )
         data = _compressed_depth(rng)
         return Seed(word, {}, about=CompressedImage(Header(), word, data))
     encoding = rng.choice([*ENCODINGS, *YUV, "MONO8", "8UC5", "", "rgb8\x00", "yuv"])
@@ -220,15 +288,21 @@ def picture(rng: Random, seed: Seed) -> Seed:
     bytes_each = np.dtype(known.dtype).itemsize * known.channels if known else rng.choice((1, 2, 2, 3))
     natural = max(0, width) * bytes_each
     step = rng.choice((*[natural] * 6, natural + rng.randrange(16), natural - 1, _size(rng)))
-    size = min(1 << 20, max(0, step * height * rng.choice((1, 1, 2)) + rng.choice((0, 0, 0, 0, 1, -1, -step))))
+    size = min(
+        1 << 20, max(0, step * height * rng.choice((1, 1, 2)) + rng.choice((0, 0, 0, 0, 1, -1, -step)))
+    )
     pixels = rng.randbytes(size) if rng.random() < 0.7 else bytes(size)
-    return Seed(encoding, {}, about=RawImage(Header(), width, height, encoding, rng.random() < 0.3, step, pixels))
+    return Seed(
+        encoding, {}, about=RawImage(Header(), width, height, encoding, rng.random() < 0.3, step, pixels)
+    )
 
 
 def _compressed_depth(rng: Random) -> bytes:
     import cv2
 
-    head = struct.pack("<iff", rng.choice((0, 1, -1)), *(rng.choice((0.0, 100.0, -1.0, 1e38, float("nan"))) for _ in "ab"))
+    head = struct.pack(
+        "<iff", rng.choice((0, 1, -1)), *(rng.choice((0.0, 100.0, -1.0, 1e38, float("nan"))) for _ in "ab")
+    )
     if rng.random() < 0.5:
         pixels = np.frombuffer(rng.randbytes(96), "<u2").reshape(6, 8)
         payload = bytearray(cv2.imencode(".png", pixels)[1].tobytes())
@@ -248,12 +322,23 @@ def points(rng: Random, seed: Seed) -> Seed:
         for k in rng.sample(range(30), rng.choice((0, 1, 1, 2))):
             numbers[k] = rng.choice((0.0, 1.0, 500.0, -1.0, 1e308, 1e-308, float("nan"), float("inf")))
         model = rng.choice(("plumb_bob", "rational_polynomial", "equidistant", "fisheye", "", "none", "x"))
-        K, R, P = np.array(numbers[:9]).reshape(3, 3), np.array(numbers[9:18]).reshape(3, 3), np.array(numbers[18:])
+        K, R, P = (
+            np.array(numbers[:9]).reshape(3, 3),
+            np.array(numbers[9:18]).reshape(3, 3),
+            np.array(numbers[18:]),
+        )
         D = tuple(numbers[18:][: rng.choice((0, 4, 5, 8, 12))])
-        return Seed(model, {}, about=CameraInfo(Header(), _size(rng), _size(rng), model, D, K, R, P.reshape(3, 4)))
+        return Seed(
+            model, {}, about=CameraInfo(Header(), _size(rng), _size(rng), model, D, K, R, P.reshape(3, 4))
+        )
     fields = []
     at = 0
-    for name in ("x", "y", "z", *rng.sample(("intensity", "ring", "t", "time", "timestamp", "x", "", "rgb"), 3)):
+    for name in (
+        "x",
+        "y",
+        "z",
+        *rng.sample(("intensity", "ring", "t", "time", "timestamp", "x", "", "rgb"), 3),
+    ):
         dtype = np.dtype(rng.choice(("<f4", "<f4", "<f4", ">f4", "<f8", "u1", "<u2", "<u4", "i1", "<i4")))
         count = 1 if rng.random() < 0.95 else rng.choice((2, 3, 0, 5000))
         fields.append(PointField(name, at if rng.random() < 0.97 else _size(rng), dtype, count))
@@ -263,4 +348,8 @@ def points(rng: Random, seed: Seed) -> Seed:
     row = width * step + rng.choice((0, 0, 0, 0, 8, -1, _size(rng)))
     size = min(1 << 20, max(0, row * height + rng.choice((0, 0, 0, 0, -1, 1))))
     shift = rng.choice((None, None, np.eye(4)))
-    return Seed("points", {}, about=Points(Header(), width, height, tuple(fields), step, row, rng.randbytes(size), shift))
+    return Seed(
+        "points",
+        {},
+        about=Points(Header(), width, height, tuple(fields), step, row, rng.randbytes(size), shift),
+    )

@@ -89,7 +89,9 @@ def _overwrite(data: bytearray, rng: Random, others: Sequence[bytes]) -> bytearr
     del others
     at = _place(len(data), rng)
     run = min(_length(len(data), rng), len(data) - at)
-    data[at : at + run] = rng.randbytes(run) if rng.random() < 0.5 else bytes([rng.choice((0, 255, 32))]) * run
+    data[at : at + run] = (
+        rng.randbytes(run) if rng.random() < 0.5 else bytes([rng.choice((0, 255, 32))]) * run
+    )
     return data
 
 
@@ -192,4 +194,13 @@ _OF_BYTES: tuple[Callable[[bytearray, Random, Sequence[bytes]], bytearray], ...]
     *(_flip, _flip, _overwrite, _truncate, _duplicate, _delete, _swap, _splice),
     *(_extreme, _extreme, _extreme, _extreme),
 )
-_OF_TEXT: tuple[Callable[[str, Random], str], ...] = (_word, _word, _word, _number, _number, _lines, _nest, _bomb)
+_OF_TEXT: tuple[Callable[[str, Random], str], ...] = (
+    _word,
+    _word,
+    _word,
+    _number,
+    _number,
+    _lines,
+    _nest,
+    _bomb,
+)

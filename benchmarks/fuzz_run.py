@@ -1,4 +1,4 @@
-"""Processes that read one input after another, watched: time, memory, exceptions, crashes, what is left behind."""
+"""Processes that read one input after another, watched: time, memory, exceptions, crashes, files left behind."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ _MIB = 1 << 20
 
 class Outcome(NamedTuple):
     """`kind` is ``read``, ``refused`` or a finding: ``error``, ``hang``, ``memory``, ``crash``, ``unclear``,
-    ``left behind``, ``seed`` (an unharmed one failed). `mib` is how far memory grew; `said` the last words."""
+    ``left behind``. `mib` is how far memory grew, `said` the last words; cases below 0 are sound seeds.
+    """
 
     reader: str
     case: int
@@ -58,7 +59,7 @@ class TooLongError(BaseException):
 class Task:
     """What every worker is told. `readers` are names of `READERS`, or "module:attribute" of others.
 
-    Seeds come in a file: `multiprocessing` waits for ever where a child dies before it has read what it is sent.
+    Seeds come in a file: `multiprocessing` waits for ever for a child that dies before it has read its data.
     """
 
     number: int
@@ -213,7 +214,7 @@ def _forget_peak() -> None:
 def _serve(task: Task, root: str, pipe: Connection) -> None:
     sys.path[:] = task.path
     os.environ["TMPDIR"] = tempfile.tempdir = str(Path(root, "tmp"))
-    log = Path(root, "log").open("w")
+    log = Path(root, "log").open("w")  # noqa: SIM115, to the end of the process
     for stream in (1, 2):  # libraries in C complain there
         os.dup2(log.fileno(), stream)
     faulthandler.enable(log)
@@ -251,7 +252,9 @@ class _Watched:
         self.root.mkdir(parents=True)
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process: BaseProcess = context.Process(target=_serve, args=(self.task, str(self.root), theirs), daemon=True)
+        self.process: BaseProcess = context.Process(
+            target=_serve, args=(self.task, str(self.root), theirs), daemon=True
+        )
         self.process.start()
         theirs.close()
         self.served = 0
@@ -271,9 +274,11 @@ class _Watched:
 
     def late(self) -> bool:
         """An input that its own clock could not stop."""
-        if self.doing is None or self.doing[1] == "warm-up":
+        if self.doing is None:
             return False
         wall, cpu = time.monotonic() - self._began[0], self._cpu_s() - self._began[1]
+        if self.doing[1] == "warm-up":  # imports and compilers
+            return wall > 5 * WALL_LIMIT_S
         return wall > WALL_LIMIT_S or cpu > 3 * self.task.cpu_limit_s
 
     def gone(self, why: str) -> tuple[Outcome, tuple[str, list[int]] | None]:

@@ -80,7 +80,9 @@ def _ours(seeds: Seeds) -> Seeds:
         "settings": [_one("settings.toml", _SETTINGS.encode())],
     }
     groups = ("rosbag1", "sqlite", "rosbag2-mcap", "mcap", "images", "flir", "clouds", "rigs")
-    small = [seed for group in groups for seed in seeds[group] if sum(map(len, seed.files.values())) < 400_000]
+    small = [
+        seed for group in groups for seed in seeds[group] if sum(map(len, seed.files.values())) < 400_000
+    ]
     return ours | {"any": small}
 
 
@@ -103,12 +105,16 @@ def _recordings(scratch: Path) -> Seeds:
         group = {"rosbag1": "rosbag1", "rosbag2": "sqlite", "rosbag2-mcap": "rosbag2-mcap"}.get(form, "mcap")
         for compression in compressions:
             out = scratch / f"{form}-{compression}"
-            seeds[group].append(_recording(write_recording(scratch / "mine", out, form, compression=compression).path))
+            seeds[group].append(
+                _recording(write_recording(scratch / "mine", out, form, compression=compression).path)
+            )
     for seed in seeds["mcap"][::2]:
         open_to_all = mcap_without_crcs(next(iter(seed.files.values())))
         seeds["mcap"].append(Seed(f"no-crc-{seed.name}", {seed.main: open_to_all}, seed.main))
     split = scratch / "split"
-    seeds["sqlite"].append(_recording(write_recording(scratch / "mine", split, "rosbag2", split_bytes=20_000).path))
+    seeds["sqlite"].append(
+        _recording(write_recording(scratch / "mine", split, "rosbag2", split_bytes=20_000).path)
+    )
     return seeds | {"messages": list(_messages(seeds))}
 
 
@@ -152,8 +158,13 @@ def _images() -> list[Seed]:
     pictures = {"8": grey, "16": (grey.astype(np.uint16) * 250), "bgr": bgr, "bgra": np.dstack([bgr, grey])}
     seeds = []
     for suffix, kinds in {
-        ".png": ("8", "16", "bgr", "bgra"), ".jpg": ("8", "bgr"), ".tiff": ("8", "16", "bgr", "bgra"),
-        ".bmp": ("8", "bgr"), ".webp": ("bgr",), ".pgm": ("8", "16"), ".ppm": ("bgr",),
+        ".png": ("8", "16", "bgr", "bgra"),
+        ".jpg": ("8", "bgr"),
+        ".tiff": ("8", "16", "bgr", "bgra"),
+        ".bmp": ("8", "bgr"),
+        ".webp": ("bgr",),
+        ".pgm": ("8", "16"),
+        ".ppm": ("bgr",),
     }.items():
         for kind in kinds:
             data = cv2.imencode(suffix, pictures[kind])[1].tobytes()
@@ -171,11 +182,19 @@ def _pillow_images(bgr: Any) -> list[Seed]:
     seeds = []
     for name, kind, options in (
         *(("palette.png", "P", {}), ("bits.png", "1", {}), ("grey-alpha.png", "LA", {})),
-        *(("lzw.tiff", "RGB", {"compression": "tiff_lzw"}), ("deflate.tiff", "L", {"compression": "tiff_deflate"})),
-        *(("packbits.tiff", "L", {"compression": "packbits"}), ("progressive.jpg", "RGB", {"progressive": True})),
+        *(
+            ("lzw.tiff", "RGB", {"compression": "tiff_lzw"}),
+            ("deflate.tiff", "L", {"compression": "tiff_deflate"}),
+        ),
+        *(
+            ("packbits.tiff", "L", {"compression": "packbits"}),
+            ("progressive.jpg", "RGB", {"progressive": True}),
+        ),
     ):
         stream = io.BytesIO()
-        Image.fromarray(bgr).convert(kind).save(stream, {"jpg": "jpeg"}.get(name[-3:], name.split(".")[-1]), **options)
+        Image.fromarray(bgr).convert(kind).save(
+            stream, {"jpg": "jpeg"}.get(name[-3:], name.split(".")[-1]), **options
+        )
         seeds.append(_one(name, stream.getvalue()))
     return seeds
 
@@ -195,7 +214,10 @@ def _clouds(scratch: Path) -> list[Seed]:
     scan = next((scratch / "mine" / "lidar").iterdir())
     made |= {"mine.pcd": scan.read_bytes()}
     try:
-        made |= {f"a.{'laz' if packed else 'las'}": make["las"](xyz.astype(float), packed) for packed in (False, True)}
+        made |= {
+            f"a.{'laz' if packed else 'las'}": make["las"](xyz.astype(float), packed)
+            for packed in (False, True)
+        }
     except ImportError:
         print("laspy is not installed: LAS and LAZ are not fuzzed")
     return [_one(name, data) for name, data in made.items()]
@@ -204,7 +226,9 @@ def _clouds(scratch: Path) -> list[Seed]:
 def _flir() -> list[Seed]:
     made = runpy.run_path(str(ROOT / "tests/radiometric/flirfile.py"))
     scene = made["scene"]()
-    seeds = [_one(f"{c}.jpg", made["flir_jpeg"](coding=c, visible=scene)) for c in ("raw", "png", "swapped-png")]
+    seeds = [
+        _one(f"{c}.jpg", made["flir_jpeg"](coding=c, visible=scene)) for c in ("raw", "png", "swapped-png")
+    ]
     return [*seeds, _one("dji.jpg", made["dji_jpeg"]())]
 
 
@@ -219,7 +243,13 @@ def _rigs(scratch: Path) -> list[Seed]:
     seeds = []
     for form in FORMATS:
         for k, rig in enumerate((truth, Rig(lenses, truth.transforms), Rig(lenses))):
-            suffix = {"rig": ".toml", "koide": ".json", "kitti": ".txt", "plain": ".txt", "kitti-raw": ""}.get(form, ".yaml")
+            suffix = {
+                "rig": ".toml",
+                "koide": ".json",
+                "kitti": ".txt",
+                "plain": ".txt",
+                "kitti-raw": "",
+            }.get(form, ".yaml")
             out = scratch / f"rig-{form}-{k}{suffix}"
             try:
                 write_rig(out, rig, form)
@@ -244,9 +274,13 @@ def _record() -> Seed:
 def _real(shared: Path) -> Iterator[tuple[str, Seed]]:
     """The real files that are not too large to be written thousands of times."""
     for group, pattern in (
-        *(("rosbag1", "recordings/*.bag"), ("mcap", "recordings/*/*/*.mcap"), ("mcap", "recordings/*/*/*/*.mcap")),
-        *(("sqlite", "recordings/*/*sqlite3"), ("sqlite", "recordings/*/sqlite3/*")),
-        *(("rosbag2-mcap", "recordings/*/*mcap"), ("rosbag2-mcap", "recordings/*/mcap/*")),
+        *(
+            ("rosbag1", "recordings/*.bag"),
+            ("mcap", "recordings/*/*/*.mcap"),
+            ("mcap", "recordings/*/*/*/*.mcap"),
+        ),
+        *(("sqlite", "recordings/*/test*sqlite3"), ("sqlite", "recordings/*/sqlite3/*")),
+        *(("rosbag2-mcap", "recordings/*/test*mcap"), ("rosbag2-mcap", "recordings/*/mcap/*")),
         *(("flir", "radiometric/*.jpg"), ("flir", "radiometric/*/*.JPG"), ("images", "radiometric/*.tiff")),
         *(("clouds", "mine_lidar/*.pcd"), ("clouds", "kitti_object/velodyne/*.bin")),
         *(("images", "rgbt_pairs/*/*/*.jpg"), ("images", "kitti_depth/groundtruth/*05.png")),

@@ -30,7 +30,7 @@ def read_settings(path: Path, form: str, paths: Iterable[tuple[str, str]] = ()) 
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise UsageError("too large for a configuration", where=path)
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # no TOML, or one made to break its reader
         raise UsageError(f"cannot be read as TOML: {error}", where=path) from None
     if settings.get("format") != form:
         raise UsageError(

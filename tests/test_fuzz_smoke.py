@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import pickle
-import re
+import struct
 import subprocess
 import sys
-import time
+import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
-from fusion.errors import FrameError, InputError, UsageError
+from fusion.errors import FrameError
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "benchmarks"))
@@ -23,14 +26,14 @@ import fuzz_run  # noqa: E402
 from fuzz_readers import READERS, Reader  # noqa: E402
 from fuzz_seeds import Seed  # noqa: E402
 
-INPUTS = 30  # of each broken reader
+SOUND = b"x" * 32
 
 
 def _broken(harm: Any) -> Any:
-    """A reader that refuses all inputs but that of the length of the seed, where it does harm."""
+    """A reader that refuses everything, and does harm where the seed is damaged."""
 
     def read(path: Path, seed: Seed) -> str:
-        if len(path.read_bytes()) > 64 or not seed.name:
+        if path.read_bytes() != SOUND:
             harm(path)
         raise FrameError("refused", where=path)
 
@@ -68,8 +71,8 @@ def _crash(_: Path) -> None:
 
 
 def _stuck_in_c(_: Path) -> None:
-    """Its own clock cannot stop it: Python does not come to a signal before the match has ended."""
-    re.match(r"(a*)*b", "a" * 64)
+    """Its own clock cannot stop it: Python does not come to a signal before the sum is done."""
+    sum(range(10**12))
 
 
 def _leave(path: Path) -> None:
@@ -82,11 +85,11 @@ def _leave_the_folder(path: Path) -> None:
 
 
 def _long_words(path: Path) -> None:
-    class Wordy(FrameError):
+    class WordyError(FrameError):
         def __str__(self) -> str:
             return "x\ny"
 
-    raise Wordy("x", where=path)
+    raise WordyError("x", where=path)
 
 
 HARMS: dict[str, tuple[Any, str]] = {
@@ -112,7 +115,7 @@ def __getattr__(name: str) -> Reader:
 
 
 def _seeds(folder: Path) -> Path:
-    seeds = {"small": [Seed("", {"a": b"x" * 32}, "a")]}
+    seeds = {"small": [Seed("sound", {"a": SOUND}, "a")]}
     file = folder / "seeds"
     file.write_bytes(pickle.dumps(seeds))
     return file
@@ -122,9 +125,9 @@ def test_every_kind_of_harm_is_found(tmp_path: Path) -> None:
     """One input each; the worker that it ends is replaced, and the rest is still done."""
     targets = {name: f"{__name__}:broken_{name}" for name in HARMS}
     task = fuzz_run.Task(1, targets, _seeds(tmp_path), cpu_limit_s=0.3)
-    outcomes = list(fuzz_run.run(task, dict.fromkeys(HARMS, 2), tmp_path / "run"))
+    outcomes = list(fuzz_run.run(task, dict.fromkeys(HARMS, 1), tmp_path / "run"))
     found = {(one.reader, one.case): one.kind for one in outcomes if one.case >= 0}
-    assert found == {(name, case): kind for name, (_, kind) in HARMS.items() for case in (0, 1)}
+    assert found == {(name, 0): kind for name, (_, kind) in HARMS.items()}
 
 
 @pytest.mark.parametrize("name", [name for name in READERS if name != "inspect"])
@@ -139,13 +142,7 @@ def test_an_input_is_made_again_from_its_number(name: str) -> None:
 
 
 def test_repairs_are_right() -> None:
-    """OpenCV reads what is repaired; a chunk whose CRC is taken out is believed."""
-    import struct
-    import zlib
-
-    import cv2
-    import numpy as np
-
+    """The CRC of a PNG's header is that of its bytes; what is no PNG stays as it is."""
     picture = np.arange(64, dtype=np.uint8).reshape(8, 8)
     data = bytearray(cv2.imencode(".png", picture)[1].tobytes())
     data[29:33] = b"\0\0\0\0"
@@ -165,19 +162,27 @@ def test_the_page_says_what_was_found() -> None:
 
 
 def test_a_small_run(tmp_path: Path) -> None:
-    """Every reader, few inputs, as the command does it: nothing is found, every sound seed is read."""
+    """The quicker readers, few inputs, as the command does it: nothing is found, every sound seed is read."""
+    names = ("rosbag1", "sqlite", "mcap", "messages", "settings", "rows", "records", "names", "rig")
     page = tmp_path / "fuzz.md"
-    command = [sys.executable, "benchmarks/fuzz.py", "--inputs", "120", "--seed", "3", "--data", str(tmp_path / "none")]
+    command = [sys.executable, "benchmarks/fuzz.py", "--inputs", "150", "--seed", "3", "--only", *names]
+    command += ["--data", str(tmp_path / "none")]
     done = subprocess.run(
-        [*command, "--write", str(page)], cwd=ROOT, capture_output=True, text=True, env=_environment(), check=False
+        [*command, "--write", str(page)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=_environment(),
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = [line.split(" | ") for line in page.read_text("utf-8").splitlines() if line.startswith("| ")][1:]
-    assert {row[0].removeprefix("| ") for row in rows[1:]} == set(READERS)
+    rows = [line.split(" | ") for line in page.read_text("utf-8").splitlines() if line.startswith("| ")][2:]
+    assert {row[0].removeprefix("| ") for row in rows} == set(names)
+    sound = [row[2].split(" of ") for row in rows if row[2] != "drawn"]
+    assert len(sound) == len(names) - 1
+    assert all(read == there for read, there in sound)
     assert "**no real files**" in page.read_text("utf-8")
 
 
 def _environment() -> dict[str, str]:
-    import os
-
     return {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}

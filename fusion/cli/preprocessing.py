@@ -108,6 +108,7 @@ def _campaign(
     work = PreprocessWork(footage, config, make_plan(footage, config, registration), rig)
     if not quiet or dry_run:
         print("\n".join(campaign_plan(work, guessed)), flush=True)
+    warn(footage.notes())
     if dry_run or out is None:
         return None
     with _progress(quiet) as progress:

@@ -15,7 +15,7 @@ from fusion.preprocess.campaign import Report, Route, run_campaign
 from fusion.preprocess.local import Progress, no_progress
 from fusion.preprocess.records import rows_of
 from fusion.preprocess.rows import FrameRow
-from fusion.preprocess.work import PreprocessWork
+from fusion.preprocess.work import FAULT, PreprocessWork
 from fusion.sinks.index import columns_of
 from fusion.sinks.run_folder import first_difference
 from fusion.storage import RunStorage, open_storage
@@ -117,7 +117,8 @@ def _lost_csv(report: Report) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("role", "reason", "count"))
-    writer.writerows((*key.partition(": ")[::2], count) for key, count in sorted(report.lost.items()))
+    counted = sorted((key, count) for key, count in report.lost.items() if not key.startswith(FAULT))
+    writer.writerows((*key.partition(": ")[::2], count) for key, count in counted)
     return text.getvalue().encode("utf-8", "surrogateescape")
 
 

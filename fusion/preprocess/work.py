@@ -30,6 +30,8 @@ from fusion.sinks.run_folder import RUN_FORMAT
 from fusion.storage import Storage
 from fusion.thermal import WindowPlan, plan_windows
 
+FAULT = "recording: "  # what is lost to damage, among what is lost for other reasons
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -146,6 +148,7 @@ class PreprocessWork:
         writing = [output.open(chunk, out) for output in outputs]
         rows: list[FrameRow] = []
         lost: Counter[str] = Counter()
+        known = {*self.footage.notes()}
         try:
             for moment in self.footage.moments(chunk):
                 if isinstance(moment, Dropped):
@@ -158,6 +161,8 @@ class PreprocessWork:
             for each in writing:
                 each.discard()
             raise
+        # Damage that was met on the way; chunks under way beside this one may tell it too.
+        lost.update(f"{FAULT}{fault}" for fault in self.footage.notes() if fault not in known)
         kept = [astuple(row) for row in rows]
         return Done(chunk, kept, files, dict(lost), time.monotonic() - began)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fusion.preprocess.recorded import RecordedFootage
 from fusion.preprocess.run import Result
-from fusion.preprocess.work import PreprocessWork
+from fusion.preprocess.work import FAULT, PreprocessWork
 from fusion.report.table import LOUD_SKIPS, table
 from fusion.report.text import registration_text, rig_rows
 
@@ -29,7 +29,7 @@ def campaign_plan(work: PreprocessWork, guessed: Sequence[str]) -> list[str]:
         camera = "the rig's RGB camera" if work.onto_rgb else "a virtual camera: no rig says where RGB is"
         rows.append(("depth", f"{work.config.depth.dense.method}, for {camera}"))
     rows.append(("outputs", ", ".join(work.config.outputs.kinds)))
-    return [*table(rows), *(f"note: {note}" for note in (*guessed, *footage.notes(), *fuser.notes))]
+    return [*table(rows), *(f"note: {note}" for note in (*guessed, *fuser.notes))]
 
 
 def _stream_rows(footage: RecordedFootage) -> list[tuple[str, str]]:
@@ -64,7 +64,9 @@ def campaign_end(result: Result) -> list[str]:
         rows.append(("rate", f"{report.frames_per_s:.1f} frames a second, {report.seconds:.1f} s"))
     rows += [
         ("dropped" if k == 0 else "", f"{count} x {reason}")
-        for k, (reason, count) in enumerate(sorted(report.lost.items()))
+        for k, (reason, count) in enumerate(
+            sorted(item for item in report.lost.items() if not item[0].startswith(FAULT))
+        )
     ]
     rows += [("written to", result.url), *(("", product) for product in result.products)]
     return table(rows)
@@ -73,7 +75,8 @@ def campaign_end(result: Result) -> list[str]:
 def campaign_warnings(result: Result) -> list[str]:
     """What the user should act on, a line each."""
     report = result.report
-    warnings = [f"skipped {stem}: {reason}" for stem, reason in result.skipped[:LOUD_SKIPS]]
+    warnings = [key for key in sorted(report.lost) if key.startswith(FAULT)]
+    warnings += [f"skipped {stem}: {reason}" for stem, reason in result.skipped[:LOUD_SKIPS]]
     if len(result.skipped) > LOUD_SKIPS:
         warnings.append(f"… and {len(result.skipped) - LOUD_SKIPS} more, all named in frames.csv")
     if result.troubled:

@@ -121,3 +121,19 @@ def test_an_output_inside_the_input_is_refused(fusion: Run, flight: Path) -> Non
     done = run(fusion, "preprocess mine {flight} -o {out}", flight=str(flight), out=str(flight / "fused"))
     assert done.code != 0
     assert "lies inside the input" in done.err
+
+
+def test_damage_is_told_in_every_run(fusion: Run, flight: Path, mcap: Path, tmp_path: Path) -> None:
+    data = bytearray(mcap.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 64] = bytes(64)
+    hurt = tmp_path / "hurt.mcap"
+    hurt.write_bytes(data)
+    out, rig = str(tmp_path / "out"), str(flight / "truth" / "rig.toml")
+    done = run(fusion, "preprocess {hurt} -o {out} --rig {rig} --chunk-s 1", hurt=str(hurt), out=out, rig=rig)
+    assert done.code == 0, done.err
+    assert "CRC" in done.err
+    again = run(
+        fusion, "preprocess {hurt} -o {out} --rig {rig} --chunk-s 1", hurt=str(hurt), out=out, rig=rig
+    )
+    assert "CRC" in again.err

@@ -69,7 +69,7 @@ def test_killed_and_started_again(bag: Path, flight: Path, whole: dict[str, byte
 def test_workers_share_nothing_but_an_object_store(
     bag: Path, flight: Path, whole: dict[str, bytes], tmp_path: Path, s3_endpoint: str
 ) -> None:
-    """The recording lies in one bucket, the frames go to another; a worker and the scheduler die on the way."""
+    """The recording lies in one bucket, the frames go to another; a worker and the scheduler die."""
     open_storage("s3://input/flights").write("flight.bag", bag.read_bytes())
     out = open_storage("s3://output/flight")
     with Machines(tmp_path) as machines:

@@ -20,8 +20,11 @@ from fusion.preprocess.config import PreprocessConfig, StreamsConfig
 from fusion.preprocess.footage import Dropped, Moment
 from fusion.preprocess.recorded import RecordedFootage
 from fusion.preprocess.streams import resolve_streams
+from fusion.preprocess.work import PreprocessWork, make_plan
 from fusion.recordings import open_recording
+from fusion.rig import load_rig
 from fusion.simulate.containers import COMPRESSIONS, write_recording
+from fusion.storage import open_storage
 from tests.preprocess.flights import flight as flight
 from tests.preprocess.flights import tree
 
@@ -222,3 +225,19 @@ def test_clocks_that_are_apart_are_told(bag: Path) -> None:
         streams, _ = resolve_streams(recording, StreamsConfig())
     with pytest.raises(InputError, match=r"stamps lie 100\.\d s apart"):
         RecordedFootage(str(bag), replace(streams, offset_ns={"fir": 100 * 10**9}))
+
+
+def test_damage_that_is_met_on_the_way_is_in_the_chunk_that_met_it(
+    flight: Path, bag: Path, tmp_path: Path
+) -> None:
+    """Planning looks here and there: of a long recording it does not see every chunk."""
+    config = PreprocessConfig.of(fuse={"warp": {"rig": str(flight / "truth" / "rig.toml")}})
+    footage = footage_of(bag)
+    work = PreprocessWork(
+        footage, config, make_plan(footage, config), load_rig(flight / "truth" / "rig.toml")
+    )
+    told = iter([[], ["chunk at byte 7 is damaged"]])
+    footage.notes = lambda: next(told)  # type: ignore[method-assign]  # before, and after
+    done = work.do(work.chunks[0], open_storage(tmp_path), lambda: None)
+    assert done.lost["recording: chunk at byte 7 is damaged"] == 1
+    assert done.rows
