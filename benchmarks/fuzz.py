@@ -52,7 +52,7 @@ def page(outcomes: list[Outcome], seeds: Seeds, number: int, seconds: float, rea
                 cpu=runs.CPU_LIMIT_S, wall=runs.WALL_LIMIT_S, spare=runs.SPARE_MIB, words=runs.MOST_WORDS
             ),
             "## Result\n",
-            f"{len(inputs):,} inputs, {len(bad)} findings, in {seconds / 60:.1f} minutes with two processes;"
+            f"{len(inputs):,} inputs, {len(bad)} findings, in {seconds / 60:.1f} minutes;"
             f" {datetime.now(UTC):%Y-%m-%d}, seed {number}, {real}.\n",
             *version_lines()[:1],
             "",
@@ -119,6 +119,7 @@ def _finding(outcome: Outcome) -> str:
 def _keep(outcome: Outcome, seeds: Seeds, number: int, folder: Path) -> None:
     seed = runs.input_of(READERS[outcome.reader], seeds, number, outcome.case)
     place = folder / f"{outcome.reader}-{outcome.case}"
+    place.mkdir(parents=True, exist_ok=True)
     runs.lay_out(seed, place)
     (place / "said.txt").write_text(f"{outcome.kind}\n{seed.name}\n{outcome.said}\n")
 
@@ -144,6 +145,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path, help="the page to write")
     parser.add_argument("--inputs", type=int, default=INPUTS)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=list(READERS), default=list(READERS), metavar="READER")
     parser.add_argument("--case", help="READER:K: only this one, here")
     parser.add_argument("--keep", type=Path, help="a folder for the inputs of findings")
@@ -161,7 +163,7 @@ def main() -> int:
         counts = shares(options.inputs, options.only)
         (scratch / "seeds.pickle").write_bytes(pickle.dumps(seeds))
         task = Task(options.seed, dict.fromkeys(READERS, ""), scratch / "seeds.pickle")
-        outcomes = list(_told(runs.run(task, counts, scratch / "run"), sum(counts.values())))
+        outcomes = list(_told(runs.run(task, counts, scratch / "run", options.workers), sum(counts.values())))
         for outcome in filter(_is_finding, outcomes):
             if options.keep:
                 _keep(outcome, seeds, options.seed, options.keep)

@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 _TRIES = 20
+_ALL: Any = tuple(HealthCheck)
 
 
 def drawn(strategy: st.SearchStrategy[Any], rng: Random) -> Any:
@@ -35,7 +36,7 @@ def drawn(strategy: st.SearchStrategy[Any], rng: Random) -> Any:
 def _one_input(strategy: st.SearchStrategy[Any]) -> Callable[[bytes, list[Any]], None]:
     kept: list[Any] = []
 
-    @settings(database=None, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(database=None, deadline=None, suppress_health_check=_ALL)
     @given(strategy)
     def keep(value: Any) -> None:
         kept.append(value)
@@ -54,8 +55,9 @@ _NAMES = st.sampled_from(
     ["header", "stamp", "data", "width", "height", "a", "encoding", "points", "frame_id"]
 )
 _TYPE_WORDS = """
-bool byte int8 uint8 int64 float32 float64 string wstring time duration Header std_msgs/Header a/B a/msg/C B Image
-builtin_interfaces/Time sensor_msgs/PointField string<=8 uint8<=3 unknown/Type boolean sequence<octet> octet
+bool byte int8 uint8 int64 float32 float64 string wstring time duration Header std_msgs/Header a/B a/msg/C B
+Image builtin_interfaces/Time sensor_msgs/PointField string<=8 uint8<=3 unknown/Type boolean
+sequence<octet> octet
 """
 _ARRAY_WORDS = "[] [3] [0] [<=4] [1048576] [4294967295] [9999999999] [-1]"
 _TYPES = st.sampled_from(_TYPE_WORDS.split())
@@ -180,8 +182,11 @@ def _shaped(value: Any, name: str, rng: Random) -> Any:
         "foxglove.FrameTransforms": {
             "transforms": [
                 {
-                    **{"timestamp": stamp, "parent_frame_id": "a", "child_frame_id": "b"},
-                    **{"translation": zero, "rotation": {**zero, "w": 1}},
+                    "timestamp": stamp,
+                    "parent_frame_id": "a",
+                    "child_frame_id": "b",
+                    "translation": zero,
+                    "rotation": {**zero, "w": 1},
                 }
             ]
         },

@@ -46,7 +46,7 @@ def recording(path: Path, seed: Seed) -> str:
 
     found = open_recording(path)
     try:
-        list(found.topics), list(found.files)
+        assert all(isinstance(file, str) for file in found.files)
         size = 0
         for k, (_, log_ns, data) in enumerate(found.packets()):
             size += len(data) + 0 * log_ns
@@ -238,9 +238,10 @@ def inspected(path: Path, seed: Seed) -> str:
 
     pictures = sum(map(len, seed.files.values())) % 3 == 0
     finding = inspect(path, full=not pictures, pictures=pictures, also=(_calibration_kind(),))
-    json_of(finding), list(text_of(finding))
+    assert json_of(finding)
+    assert list(text_of(finding))
     if pictures:
-        page_of(finding)
+        assert page_of(finding)
     return ""
 
 

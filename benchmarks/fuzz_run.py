@@ -1,4 +1,4 @@
-"""Processes that read one input after another, watched: time, memory, exceptions, crashes, files left behind."""
+"""Processes that read input after input, watched: time, memory, exceptions, crashes, files left behind."""
 
 from __future__ import annotations
 
@@ -287,7 +287,8 @@ class _Watched:
         code = self.process.exitcode
         name, case = self.doing or ("", -1)
         log = self.root / "log"
-        said = f"exit code {code}: " + (log.read_text("utf-8", "replace")[-1500:] if log.exists() else "")
+        words = log.read_text("utf-8", "replace").partition("Extension modules:")[0] if log.exists() else ""
+        said = f"{words[-2500:].strip()}\nexit code {code}"
         number = case if isinstance(case, int) else -1
         rest = None
         if self.batch is not None and isinstance(case, int):

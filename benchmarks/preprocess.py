@@ -129,7 +129,7 @@ def _against_parts(
         jobs["fuse"] = _on(pool, fuse, list(zip(moments, made, strict=True)))
         jobs["campaign"] = lambda: clocked(lambda: _campaign(space, work, Route(workers), len(moments)))
         jobs["plan"] = lambda: clocked(lambda: planned(path, rig, amount.chunk_s).footage.close())
-        taken = interleaved(jobs, amount.rounds)
+        taken = interleaved(jobs, amount.rounds, warm=0)  # making the frames was the warm-up
     frames, shared = len(moments), [taken[name] for name in parts]
     least = _sum(*shared)
     fused = _sum(least, taken["fuse"])

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,19 @@ from fusion.errors import FrameError
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "benchmarks"))
 
-import fuzz  # noqa: E402
-import fuzz_mutate  # noqa: E402
-import fuzz_run  # noqa: E402
-from fuzz_readers import READERS, Reader  # noqa: E402
-from fuzz_seeds import Seed  # noqa: E402
-
+fuzz: Any = import_module("fuzz")
+fuzz_mutate: Any = import_module("fuzz_mutate")
+fuzz_run: Any = import_module("fuzz_run")
+READERS: dict[str, Any] = import_module("fuzz_readers").READERS
+Reader: Any = import_module("fuzz_readers").Reader
+Seed: Any = import_module("fuzz_seeds").Seed
 SOUND = b"x" * 32
 
 
 def _broken(harm: Any) -> Any:
     """A reader that refuses everything, and does harm where the seed is damaged."""
 
-    def read(path: Path, seed: Seed) -> str:
+    def read(path: Path, seed: Any) -> str:
         if path.read_bytes() != SOUND:
             harm(path)
         raise FrameError("refused", where=path)
@@ -41,7 +42,7 @@ def _broken(harm: Any) -> Any:
 
 
 def _index(_: Path) -> None:
-    [][1]
+    raise IndexError(1)
 
 
 def _spin(_: Path) -> None:
@@ -72,7 +73,7 @@ def _crash(_: Path) -> None:
 
 def _stuck_in_c(_: Path) -> None:
     """Its own clock cannot stop it: Python does not come to a signal before the sum is done."""
-    sum(range(10**12))
+    assert sum(range(10**12))
 
 
 def _leave(path: Path) -> None:
@@ -107,7 +108,7 @@ HARMS: dict[str, tuple[Any, str]] = {
 BROKEN = {name: Reader(name, "", _broken(harm), "small", bound_mib=256) for name, (harm, _) in HARMS.items()}
 
 
-def __getattr__(name: str) -> Reader:
+def __getattr__(name: str) -> Any:
     """So that a worker finds its reader by name: ``test_fuzz_smoke:broken_index``."""
     if name.startswith("broken_"):
         return BROKEN[name.removeprefix("broken_")]
@@ -163,9 +164,10 @@ def test_the_page_says_what_was_found() -> None:
 
 def test_a_small_run(tmp_path: Path) -> None:
     """The quicker readers, few inputs, as the command does it: nothing is found, every sound seed is read."""
-    names = ("rosbag1", "sqlite", "mcap", "messages", "settings", "rows", "records", "names", "rig")
+    names = ("rosbag1", "sqlite", "messages", "settings", "rows", "records", "names")
     page = tmp_path / "fuzz.md"
-    command = [sys.executable, "benchmarks/fuzz.py", "--inputs", "150", "--seed", "3", "--only", *names]
+    command = [sys.executable, "benchmarks/fuzz.py", "--inputs", "150", "--seed", "3", "--workers", "1"]
+    command += ["--only", *names]
     command += ["--data", str(tmp_path / "none")]
     done = subprocess.run(
         [*command, "--write", str(page)],

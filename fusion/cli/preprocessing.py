@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fusion.cli.aligning import FRAMES, aligned
 from fusion.cli.blending import PLACES, rig_of
 from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
 from fusion.errors import FrameError, InputError, UsageError
@@ -104,7 +103,9 @@ def _campaign(
     config = settled(config, footage.has_lidar)
     registration = None
     if config.fuse.warp.align:
-        registration = aligned(_Here(footage, config.chunk_s), quiet=quiet).registration
+        from fusion.cli.aligning import FRAMES, aligned  # here: it is slow to import
+
+        registration = aligned(_Here(footage, config.chunk_s, FRAMES), quiet=quiet).registration
     work = PreprocessWork(footage, config, make_plan(footage, config, registration), rig)
     if not quiet or dry_run:
         print("\n".join(campaign_plan(work, guessed)), flush=True)
@@ -128,10 +129,10 @@ def _campaign(
 class _Here:
     """A frame from each of a few places in the footage: what an alignment looks at."""
 
-    def __init__(self, footage: Footage, chunk_s: float) -> None:
+    def __init__(self, footage: Footage, chunk_s: float, count: int) -> None:
         chunks = footage.chunks(chunk_s)
-        if len(chunks) < FRAMES:
-            chunks = footage.chunks(max(0.1, chunk_s * len(chunks) / FRAMES))
+        if len(chunks) < count:
+            chunks = footage.chunks(max(0.1, chunk_s * len(chunks) / count))
         self._footage, self._chunks = footage, chunks
 
     def __len__(self) -> int:

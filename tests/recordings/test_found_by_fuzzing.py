@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -39,8 +38,8 @@ def test_metadata_whose_words_are_lists_of_lists():
 
 def test_a_schema_that_is_no_text(tmp_path):
     """sqlite quotes the bytes in its own error, which Python then cannot decode."""
-    path = shutil.copy(write_rosbag2(tmp_path / "a", ROWS) / "a.db3", tmp_path / "b.db3")
-    data = path.read_bytes()
+    path = tmp_path / "b.db3"
+    data = (write_rosbag2(tmp_path / "a", ROWS) / "a.db3").read_bytes()
     assert data.count(b"CREATE TABLE messages(") == 1
     path.write_bytes(data.replace(b"CREATE TABLE messages(", b"CREATE TABLE mess\xffges("))
     with pytest.raises(InputError, match="nothing of it can be read"):
