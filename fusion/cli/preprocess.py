@@ -11,7 +11,6 @@ from fusion.cli import options
 from fusion.cli.options import RUN
 
 STREAMS = Group("Streams", sort_key=1)
-OUTPUT = Group("Output", sort_key=4)
 
 
 def preprocess(
@@ -90,7 +89,7 @@ def preprocess(
     alpha: options.Alpha = None,
     to: Annotated[
         tuple[str, ...] | None,
-        Parameter(group=OUTPUT, help="folder, mcap, video; more than one: --to folder --to mcap."),
+        Parameter(group=options.BLEND, help="folder, mcap, video; more than one: --to folder --to mcap."),
     ] = None,
     format: options.Format = None,
     quality: options.Quality = None,
