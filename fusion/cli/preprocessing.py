@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fusion.cli.blending import PLACES, rig_of
 from fusion.cli.running import quiet_libraries, refuse_overlap, threads_of, warn
-from fusion.errors import FrameError, InputError, UsageError
+from fusion.errors import FrameError, FusionError, InputError, UsageError
 from fusion.frames import FrameSet
-from fusion.manifest import Layout, load_manifest
+from fusion.manifest import Layout, Manifest, load_manifest
 from fusion.preprocess.campaign import Pace, Route
-from fusion.preprocess.config import PreprocessConfig, load_preprocess_config
+from fusion.preprocess.config import PreprocessConfig, StreamsConfig, load_preprocess_config
 from fusion.preprocess.footage import Footage, Moment, SetFootage
 from fusion.preprocess.local import Progress, no_progress
 from fusion.preprocess.recorded import RecordedFootage
@@ -74,19 +76,29 @@ def run_preprocess(
     if out is not None and "://" not in out:
         inputs = [str(root or source)] if "://" not in source else []
         refuse_overlap(inputs, Path(out), ("fused", "mask", "depth", "fir", "chunks"))
-    with quiet_libraries(), ExitStack() as open_things:
-        parts = list(_parts(config, source, root, open_things))
-        problems = []
-        for name, one_config, footage, rig, guessed in parts:
-            target = None if out is None else f"{out}/{name}" if len(parts) > 1 else out
+    parts = _parts(config, source, root)
+    problems: list[Exception] = []
+    with quiet_libraries():
+        for name, opened in parts:
+            target = None if out is None else f"{out}/{name}" if name else out
             if name and not quiet:
-                print(f"{name}:")
-            problems.append(
-                _campaign(one_config, footage, rig, guessed, target, route, overwrite, dry_run, quiet)
-            )
-    first = next((problem for problem in problems if problem is not None), None)
-    if first is not None:
-        raise first
+                print(f"{name}:", flush=True)
+            try:
+                with ExitStack() as open_things:
+                    part = opened(open_things)
+                    problem = _campaign(*part, target, route, overwrite, dry_run, quiet)
+            except FusionError as error:
+                if len(parts) == 1:
+                    raise
+                problem = error
+            if problem is not None and len(parts) > 1:
+                warn([f"{name}: {problem}"])
+            problems += [] if problem is None else [problem]
+    if problems and len(parts) > 1:
+        what = f"{len(problems)} of {len(parts)} recordings have failed or are not whole"
+        raise FusionError(what, hint="the same command tries them again, and only them")
+    if problems:
+        raise problems[0]
 
 
 def _campaign(
@@ -145,48 +157,75 @@ class _Here:
         raise FrameError("no frame there", where=f"{self._footage.name}, chunk {self._chunks[index].name}")
 
 
-Part = tuple[str, PreprocessConfig, Footage, "Rig | None", list[str]]
+Part = tuple[PreprocessConfig, Footage, "Rig | None", list[str]]
+FOR_RECORDINGS = (
+    *("rgb", "fir", "lidar", "lead", "stamp", "tolerance_ms", "lidar_tolerance_ms"),
+    *("fir_drift_ppm", "begin_s", "end_s"),
+)
 
 
 def _parts(
-    config: PreprocessConfig, source: str, root: Path | None, open_things: ExitStack
-) -> Iterator[Part]:
-    """The campaigns that the command stands for, each named below OUT if there are more: name, …"""
+    config: PreprocessConfig, source: str, root: Path | None
+) -> list[tuple[str, Callable[[ExitStack], Part]]]:
+    """The campaigns that the command stands for: what each is called below OUT ("" if it is the only one),
+    and how to open what it reads.
+    """
     if root is None and is_recording(source):
-        rig = rig_of(config.fuse)
-        yield "", config, *_recorded(config, source, rig, open_things)
-        return
+        return [("", partial(_recorded, config, source, rig_of(config.fuse)))]
     if root is None:
         known = Path(source).exists()
         hint = "a data set: fusion preprocess NAME ROOT -o OUT; fusion inspect says what a path is"
         raise InputError("is no recording" if known else "no such recording", where=source, hint=hint)
     manifest = load_manifest(source)
     layout = manifest.plan(root)
-    config = _as_the_set_says(config, layout)
-    rig = rig_of(config.fuse)
+    asked, config = config.streams, _as_the_set_says(config, layout)
     warp = config.fuse.warp
     manifest.refuse_unfit(registration=bool(warp.rig or warp.homography or warp.points or warp.align))
+    rig = rig_of(config.fuse)
     if layout.recording is None:
-        offset_ns, said = _fir_offset_ns(config, rig), list[str]()
+        _refuse_for_folders(asked)
+        return [("", partial(_folders, config, manifest, root, rig))]
+    files = layout.recording.files
+    if len(files) == 1:
+        return [("", partial(_recorded, config, str(files[0]), rig))]
+    bare = Counter(path.relative_to(root).with_suffix("") for path in files)
+    return [
+        ((short if bare[short] == 1 else own).as_posix(), partial(_recorded, config, str(path), rig))
+        for path in files
+        for own in [path.relative_to(root)]
+        for short in [own.with_suffix("")]
+    ]
+
+
+def _refuse_for_folders(asked: StreamsConfig) -> None:
+    """What means nothing for folders is not passed over in silence."""
+    vain = [name for name in FOR_RECORDINGS if name in asked.model_fields_set]
+    if vain:
+        hint = (
+            "files are chosen and paired by the manifest: copy it and change it (fusion datasets show NAME)"
+        )
+        raise UsageError(f"streams.{vain[0]} is for recordings; this data set is folders", hint=hint)
+
+
+def _folders(
+    config: PreprocessConfig, manifest: Manifest, root: Path, rig: Rig | None, open_things: ExitStack
+) -> Part:
+    def footage_at(offset_ns: int) -> SetFootage:
         colour, keep = config.fuse.thermal.fir_colour, config.streams.keep_frozen
         footage = SetFootage(manifest, root, fir_colour=colour, keep_frozen=keep, fir_offset_ns=offset_ns)
         open_things.callback(footage.close)
-        if config.streams.estimate_clock:
-            from fusion.preprocess.clocks import clock_of, in_words  # here: SciPy is slow to import
+        return footage
 
-            found = clock_of(footage)
-            said.append(in_words(found))
-            offset_ns = found.offset_ns
-            footage = SetFootage(manifest, root, fir_colour=colour, keep_frozen=keep, fir_offset_ns=offset_ns)
-        yield "", config, footage, rig, said
-        return
-    for path in layout.recording.files:
-        yield path.stem, config, *_recorded(config, str(path), rig, open_things)
+    footage = footage_at(_fir_offset_ns(config, rig))
+    if not config.streams.estimate_clock:
+        return config, footage, rig, []
+    from fusion.preprocess.clocks import clock_of, in_words  # here: SciPy is slow to import
+
+    found = clock_of(footage)
+    return config, footage_at(found.offset_ns), rig, [in_words(found)]
 
 
-def _recorded(
-    config: PreprocessConfig, path: str, rig: Rig | None, open_things: ExitStack
-) -> tuple[Footage, Rig | None, list[str]]:
+def _recorded(config: PreprocessConfig, path: str, rig: Rig | None, open_things: ExitStack) -> Part:
     recording = open_recording(path)
     open_things.callback(recording.close)
     streams, guessed = resolve_streams(recording, config.streams, rig, config.fuse.thermal.fir_colour)
@@ -203,7 +242,7 @@ def _recorded(
         )
         footage = RecordedFootage(path, shifted)
         open_things.callback(footage.close)
-    return footage, rig, guessed
+    return config, footage, rig, guessed
 
 
 def _as_the_set_says(config: PreprocessConfig, layout: Layout) -> PreprocessConfig:

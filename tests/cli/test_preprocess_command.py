@@ -137,3 +137,46 @@ def test_damage_is_told_in_every_run(fusion: Run, flight: Path, mcap: Path, tmp_
         fusion, "preprocess {hurt} -o {out} --rig {rig} --chunk-s 1", hurt=str(hurt), out=out, rig=rig
     )
     assert "CRC" in again.err
+
+
+MANIFEST = """
+format = "fusion-dataset/1"
+name = "flights"
+title = "Two flights of a simulated mine"
+licence = "ours"
+citation = "none"
+registered = false
+registration_note = "Two cameras side by side."
+
+[recording]
+files = "*.bag"
+
+[recording.topics]
+rgb = "/camera/image/compressed"
+fir = "/thermal/image"
+lidar = "/lidar/points"
+"""
+
+
+def test_one_bad_recording_does_not_stop_the_others(fusion: Run, flight: Path, tmp_path: Path) -> None:
+    (tmp_path / "flights.toml").write_text(MANIFEST)
+    root = tmp_path / "root"
+    write_recording(flight, root / "good.bag", "rosbag1")
+    (root / "bad.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    out, rig = tmp_path / "out", str(flight / "truth" / "rig.toml")
+    line = "preprocess {manifest} {root} -o {out} --rig {rig}"
+    names = {"manifest": str(tmp_path / "flights.toml"), "root": str(root), "out": str(out), "rig": rig}
+    done = run(fusion, line, **names)
+    assert done.code == 1
+    assert len(list((out / "good" / "fused").iterdir())) > 15
+    assert not (out / "bad").exists()
+    assert "warning: bad: " in done.err
+    assert done.err.splitlines()[-1].startswith("fusion: 1 of 2 recordings have failed")
+
+
+def test_what_folders_cannot_do_is_not_passed_over(fusion: Run, flight: Path, tmp_path: Path) -> None:
+    line = "preprocess mine {flight} -o {out} --begin 1"
+    done = run(fusion, line, flight=str(flight), out=str(tmp_path / "out"))
+    assert done.code == 2
+    assert "streams.begin_s is for recordings" in done.err
+    assert not (tmp_path / "out").exists()
