@@ -1,8 +1,8 @@
 """`python benchmarks/accuracy.py [--write docs] [--only PAGE] [--data FOLDER]`: results against truth.
 
-The tables replace what stands between two marks in docs/depth.md, docs/calibration.md and docs/timing.md. Real data is
-looked for in FOLDER (by default beside the checkout); what is not there is said to be not measured. The
-simulated mine and drawn sessions are always measured.
+The tables replace what stands between two marks in docs/depth.md, docs/calibration.md and docs/timing.md.
+Real data is looked for in FOLDER (by default beside the checkout); what is not there is said to be not
+measured. The simulated mine and drawn sessions are always measured.
 """
 
 from __future__ import annotations

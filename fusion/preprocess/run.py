@@ -131,7 +131,7 @@ def _refuse_another_run(store: RunStorage, work: PreprocessWork) -> None:
         return
     try:
         before = tomllib.loads(store.read(RUN).decode())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise OutputError(f"its run.toml cannot be read: {error}", where=store.url, hint=hint) from None
     difference = first_difference(before, work.description)
     if difference:
