@@ -105,6 +105,9 @@ def preprocess(
     scheduler: Annotated[
         str | None, Parameter(group=RUN, help="Address of a Dask scheduler, tcp://host:port.")
     ] = None,
+    wait_s: Annotated[
+        float | None, Parameter(group=RUN, help="How long to wait for a first Dask worker. Default: 600.")
+    ] = None,
     strict: Annotated[bool | None, Parameter(group=RUN, help="A frame that cannot be used fails.")] = None,
     overwrite: Annotated[
         bool, Parameter(group=RUN, help="Replace the frames of another run in OUT.")
@@ -123,7 +126,7 @@ def preprocess(
         source,
         root,
         out,
-        route=preprocessing.route_of(workers, cluster, scheduler),
+        route=preprocessing.route_of(workers, cluster, scheduler, wait_s),
         overwrite=overwrite,
         dry_run=dry_run,
         quiet=quiet,

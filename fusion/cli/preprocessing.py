@@ -56,8 +56,9 @@ def settings_of(config: Path | None, given: Mapping[str, Any]) -> PreprocessConf
     return load_preprocess_config(config, nested({**fuse, **OWN_PLACES}, given))
 
 
-def route_of(workers: int | None, cluster: str | None, scheduler: str | None) -> Route:
-    return Route(threads_of(workers), cluster == "local", scheduler or "")
+def route_of(workers: int | None, cluster: str | None, scheduler: str | None, wait_s: float | None) -> Route:
+    route = Route(threads_of(workers), cluster == "local", scheduler or "")
+    return route if wait_s is None else replace(route, wait_s=wait_s)
 
 
 def run_preprocess(
