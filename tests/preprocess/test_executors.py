@@ -134,7 +134,9 @@ def nothing_watched() -> None:
 
 def test_chunks_begin_in_order_and_few_at_a_time(tmp_path: Path) -> None:
     run_toy(Watched(chunks_of(12, 3), delay_s=0.002), str(tmp_path), Route(3))
-    assert sorted(BEGUN) == BEGUN
+    assert sorted(BEGUN) == list(range(12))
+    # Handed out in order; two threads that are given theirs at once may begin in either order.
+    assert all(abs(place - index) < 3 for place, index in enumerate(BEGUN))
     assert max(MOST) == 3
     assert set(THREADS) == {1}
 

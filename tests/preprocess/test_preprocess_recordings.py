@@ -102,7 +102,7 @@ def test_folders_give_the_same_pictures_as_recordings(
         "warp": {"rig": str(flight / "truth" / "rig.toml")},
         "thermal": {"window": (7000.0, 7700.0), "window_unit": "counts"},
     }
-    config = PreprocessConfig.of(fuse=fuse, streams={"tolerance_ms": 25.0})
+    config = PreprocessConfig.of(fuse=fuse)
     for source, root, name in (
         ("mine", flight, "set"),
         (str(write_recording(flight, tmp_path / "mine.mcap", "mcap-ros1").path), None, "recording"),
