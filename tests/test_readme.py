@@ -46,14 +46,9 @@ OTHERS = (
     "fusion datasets check mine mine/",
     "fusion simulate record mine/ mine.bag --form rosbag1",
 )
-DASKS = {
-    "--tls-ca-file",
-    "--nworkers",
-    "--no-dashboard",
-    "--death-timeout",
-    "--lifetime",
-    "--tls-cert",
-    "--tls-key",
+FOREIGN = {  # options of Dask's commands, and of the benchmarks' scripts
+    *("--tls-ca-file", "--tls-cert", "--tls-key", "--nworkers", "--no-dashboard", "--death-timeout"),
+    *("--lifetime", "--keep"),
 }
 SHELLS = ("", "sh", "bash", "console")
 
@@ -152,7 +147,7 @@ def spoken(document: Path) -> Iterator[str]:
     for span in re.findall(r"`([^`\n]+)`", prose(document)):
         if span.startswith("fusion "):
             yield span
-        elif span.startswith("--") and span.split()[0] not in DASKS:
+        elif span.startswith("--") and span.split()[0] not in FOREIGN:
             yield f"{_command_with(span.split()[0], document.name)} {span}"
 
 
