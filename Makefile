@@ -31,7 +31,7 @@ demo: $(VENV)/ready
 	@echo "Look at demo/fused/preview.png, at demo/depth/picture/ and demo/depth/overlay/, then at the frames in demo/fused/fused/ and the indexes frames.csv"
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
