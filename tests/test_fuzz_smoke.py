@@ -125,7 +125,7 @@ def _seeds(folder: Path) -> Path:
 def test_every_kind_of_harm_is_found(tmp_path: Path) -> None:
     """One input each; the worker that it ends is replaced, and the rest is still done."""
     targets = {name: f"{__name__}:broken_{name}" for name in HARMS}
-    task = fuzz_run.Task(1, targets, _seeds(tmp_path), cpu_limit_s=0.3)
+    task = fuzz_run.Task(1, targets, _seeds(tmp_path), cpu_limit_s=1.5)
     outcomes = list(fuzz_run.run(task, dict.fromkeys(HARMS, 1), tmp_path / "run"))
     found = {(one.reader, one.case): one.kind for one in outcomes if one.case >= 0}
     assert found == {(name, 0): kind for name, (_, kind) in HARMS.items()}
