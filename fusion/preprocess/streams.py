@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
-from fusion.errors import InputError, UsageError
+from fusion.errors import FrameError, InputError, UsageError
 from fusion.messages import reader_of
 from fusion.messages.base import CompressedImage, Points, RawImage
 from fusion.messages.roles import Roles, Seen, roles_of
@@ -108,4 +109,8 @@ def _seen(recording: Recording, topic: Topic) -> Seen:
     if reader.kind not in (RawImage, CompressedImage, Points):
         return Seen.of(topic, reader.kind)
     packet = next(iter(recording.packets([topic])), None)
-    return Seen.of(topic, reader.kind, None if packet is None else reader.message(packet.data))
+    message = None
+    if packet is not None:
+        with suppress(FrameError):  # one damaged message says nothing of its topic
+            message = reader.message(packet.data)
+    return Seen.of(topic, reader.kind, message)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from fusion.preprocess.recorded import RecordedFootage
 from fusion.preprocess.streams import resolve_streams
 from fusion.preprocess.work import PreprocessWork, make_plan
 from fusion.recordings import open_recording
+from fusion.recordings.base import Packet
 from fusion.rig import load_rig
 from fusion.simulate.containers import COMPRESSIONS, write_recording
 from fusion.storage import open_storage
@@ -242,3 +244,22 @@ def test_damage_that_is_met_on_the_way_is_in_the_chunk_that_met_it(
     done = work.do(work.chunks[0], open_storage(tmp_path), lambda: None)
     assert done.lost["recording: chunk at byte 7 is damaged"] == 1
     assert done.rows
+
+
+def test_a_damaged_first_message_does_not_end_the_run(bag: Path) -> None:
+    """Which topic is what is told from first messages; the other two lanes do not depend on this one."""
+    with closing(open_recording(bag)) as recording:
+        whole = recording.packets
+
+        def cut(topics: Any = None, start_ns: Any = None, end_ns: Any = None) -> Iterator[Packet]:
+            for k, packet in enumerate(whole(topics, start_ns, end_ns)):
+                hurt = k == 0 and packet.topic.name == "/lidar/points"
+                yield packet._replace(data=bytes(packet.data[:40])) if hurt else packet
+
+        recording.packets = cut  # type: ignore[method-assign]
+        streams, _ = resolve_streams(recording, StreamsConfig())
+    assert {role: topic.name for role, topic in streams.topics.items()} == {
+        "rgb": "/camera/image/compressed",
+        "fir": "/thermal/image",
+        "lidar": "/lidar/points",
+    }
